@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import units
@@ -27,7 +28,7 @@ def check_units(
     channels: Channels,
     model: mujoco.MjModel,
     log_map: LogMap,
-    through: Array,
+    through: NDArray[np.bool_],
 ) -> None:
     """Channels are in the model's units, or the map states theirs.
 

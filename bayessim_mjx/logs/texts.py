@@ -72,7 +72,7 @@ def _doubt(raw: bytes, error: UnicodeDecodeError) -> str:
     """The first line that is not UTF-8, as several encodings read it."""
     start = raw.rfind(b"\n", 0, error.start) + 1
     line = raw[start : error.start + 12].split(b"\n")[0]
-    readings = {}
+    readings: dict[str, str] = {}
     for name in _CANDIDATES:
         try:
             readings.setdefault(line.decode(name).strip()[-24:], name)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Channels
@@ -18,7 +19,7 @@ MOST = 0.95  # share of the rows that have to agree
 NEAR = 0.25 * TURN  # rad between a reading and its target, modulo a turn
 
 
-def servos(model: mujoco.MjModel, through: Array) -> Iterator[tuple[int, int]]:
+def servos(model: mujoco.MjModel, through: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
     """(actuator, joint) of the hinges with a position servo whose logged command is the target, in rad."""
     joint_types = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     for i in range(model.nu):
@@ -35,7 +36,7 @@ def placed(
     columns: dict[str, Array],
     channels: Channels,
     model: mujoco.MjModel,
-    through: Array,
+    through: NDArray[np.bool_],
     absent: tuple[str, ...] = (),
 ) -> None:
     """Moves readings and targets of hinges by whole turns in place, with a warning that says how to state it.
