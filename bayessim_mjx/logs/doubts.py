@@ -17,7 +17,7 @@ from bayessim_mjx.logs.turns import TURN, servos
 
 DEGREE = units.ANGLES["deg"]
 PLAIN = ("rad", "m", "rad/s", "m/s", "N m", "N", None)
-FAR = 0.5  # of a joint's range, by which readings in the model's unit leave it at most
+FAR = 3.0  # times a joint's range, which readings in the model's unit never reach, however loose the range is
 ALIKE = 0.8  # correlation from which a joint follows its target
 RATIO = 1.25  # within which a ratio of amplitudes is that of two units
 
@@ -94,8 +94,7 @@ def _by_name(
 
 def _by_range(table: Table, name: str, x: Array, kind: str, low: float, high: float) -> None:
     """Values beyond the joint's range that another unit would bring into it."""
-    slack = FAR * (high - low)
-    outside = (x < low - slack) | (x > high + slack)
+    outside = np.abs(x) > max(FAR * max(abs(low), abs(high)), TURN if kind == "hinge" else 0.0)
     if np.mean(outside) < 0.02:
         return
     if kind == "hinge" and np.ptp(x) < min(high - low, TURN) and not _whole(x) and _by_turns(x, low, high):
