@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 
 import mujoco
@@ -53,6 +54,8 @@ def check_units(
         kind, name = channels.kinds[j], f"qpos:{joint}"
         if kind in ("hinge", "slide") and model.jnt_limited[j] and name in unstated:
             _by_range(table, name, columns[name], kind, *map(float, model.jnt_range[j]))
+        elif kind == "hinge" and name in unstated:
+            _many_turns(table, name, columns[name])
     for i, j in followed.items():
         pair = f"qpos:{channels.joints[j]}", f"ctrl:{channels.actuators[i]}"
         if unstated & set(pair):
@@ -110,6 +113,13 @@ def _by_range(table: Table, name: str, x: Array, kind: str, low: float, high: fl
         f"{at} [{low:g}, {high:g}], and values from {x.min():.6g} to {x.max():.6g} would fit as {' or '.join(fits)}; "
         f"state one in a map (docs/logs.md): {keys}, or `unit: {own}` if they are in {own} all the same"
     )
+
+
+def _many_turns(table: Table, name: str, x: Array) -> None:
+    """Two turns to and fro of a joint without a range: rare in rad, usual in degrees."""
+    if np.ptp(x) > 2.0 * TURN and abs(x[-1] - x[0]) < 0.5 * np.ptp(x) and np.abs(np.diff(x)).max() < np.pi:
+        text = f"{table.path}: column {name!r} goes to and fro by {np.ptp(x) / TURN:.3g} turns in rad"
+        warnings.warn(f"{text}; degrees would need {_key(name, name, 'deg')} in a map", stacklevel=5)
 
 
 def _whole(x: Array) -> bool:

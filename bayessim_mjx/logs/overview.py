@@ -16,7 +16,7 @@ import yaml
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import units
 from bayessim_mjx.logs.check import needed_columns
-from bayessim_mjx.logs.files import SUFFIXES, map_of_folder, side_yaml
+from bayessim_mjx.logs.files import SUFFIXES, map_of_folder
 from bayessim_mjx.logs.log import Array, Channels
 from bayessim_mjx.logs.mapping import LogMap, Source
 from bayessim_mjx.logs.pieces import MAX_GAP, SHORT_GAP
@@ -240,12 +240,18 @@ def _read(out: Overview, files: Sequence[Path], log_map: LogMap, model: mujoco.M
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            for file in files:
-                side_yaml(file)
-                read_logs(file, model, log_map, partial=True)
-        except UserError as error:
-            out.missing.append(str(error))
+            read_logs(files, model, log_map, partial=True)
+        except UserError:
+            out.missing += [text for text in (_refusal(file, log_map, model) for file in files) if text]
     out.notes += list(dict.fromkeys(str(w.message) for w in said))
+
+
+def _refusal(file: Path, log_map: LogMap, model: mujoco.MjModel) -> str:
+    try:
+        read_logs(file, model, log_map, partial=True)
+    except UserError as error:
+        return str(error)
+    return ""
 
 
 __all__ = ["Overview", "overview"]

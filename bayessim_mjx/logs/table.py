@@ -17,6 +17,7 @@ from bayessim_mjx.logs.log import Array
 from bayessim_mjx.logs.numerals import Marks
 
 _WORDS = {"true": 1.0, "yes": 1.0, "on": 1.0, "false": 0.0, "no": 0.0, "off": 0.0, "": float("nan")}
+_COMMAS = Marks(",")
 _NUMBERS = "biufUS"  # NumPy's kinds of arrays that hold numbers, or texts of numbers
 
 
@@ -87,14 +88,16 @@ class Table:
         values = self.columns[column]
         if isinstance(values, np.ndarray) and values.dtype.kind not in _NUMBERS:
             raise UserError(f"{self.path}: column {column!r} holds {values.dtype}; allowed: real numbers")
+        if self.marks == _COMMAS and not isinstance(values, np.ndarray) and not any("." in v for v in values):
+            values = [v.replace(",", ".") for v in values]  # as a whole, which is faster than field by field
         try:
-            if not self.marks.plain or (
+            if not (self.marks.plain or self.marks == _COMMAS) or (
                 not isinstance(values, np.ndarray) and not all(v.isascii() and "_" not in v for v in values)
             ):
                 raise ValueError("to be read field by field")
             return np.asarray(values).astype(np.float64)
         except (TypeError, ValueError):
-            words = [str(v).strip().lower() for v in values]
+            words = [str(v).strip().lower() for v in self.columns[column]]
             switch = self._switch(words)
             return np.array([self._number(column, row, word, switch) for row, word in enumerate(words)])
 

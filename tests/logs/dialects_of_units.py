@@ -54,6 +54,9 @@ def in_wrist(by: float) -> np.ndarray:
 
 
 CASES = [
+    Case("degrees of a joint without a range, stated", DEGREES,
+         text(with_column(3, DEG * TRUTH[:, 3], TRUTH)).encode(), arm(shoulder={"column": "qpos:shoulder",
+         "unit": "deg"})),
     Case("degrees by the column's name", DEGREES, NAMED, arm(shoulder="shoulder_deg"), ("unit: deg", "scale: 1"), True,
          arm(shoulder={"column": "shoulder_deg", "unit": "deg"})),
     Case("degrees beyond the joint's range", DEGREES, servo(3, DEG * S[:, 3]), None, ("qpos:wrist", "unit: deg"), True,

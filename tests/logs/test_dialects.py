@@ -8,16 +8,17 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from dialects import SERVO, TRUTH, Case
+from dialects import SERVO, TRUTH, Case, text
 from dialects_of_texts import CASES as TEXTS
 from dialects_of_times import CASES as TIMES
 from dialects_of_units import CASES as UNITS
-from log_files import ARM
+from log_files import ARM, HEADER
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs import Log, read_logs
+from bayessim_mjx.logs import Log, LogMap, read_logs
 
 CASES = {case.name: case for case in (*TEXTS, *TIMES, *UNITS)}
+OWN = {"ctrl": ("m_shoulder", "m_elbow"), "qpos": ("shoulder", "elbow")}
 MODELS = {"arm": mujoco.MjModel.from_xml_string(ARM), "servo": mujoco.MjModel.from_xml_string(SERVO)}
 
 
@@ -58,9 +59,25 @@ def test_a_dialect(name: str, tmp_path: Path) -> None:
     with pytest.raises(UserError) as error, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         read_logs(path, MODELS[case.model], case.log_map)
-    text = str(error.value)
+    refusal = str(error.value)
     for word in case.words:
-        assert word in text, text
+        assert word in refusal, refusal
     if case.mend is not None:
         log, _ = read(path, case, {**(case.log_map or {}), **case.mend})
         true(log, case)
+
+
+def test_units_that_nothing_proves_are_warned_of_with_their_key(tmp_path: Path) -> None:
+    """A joint without a range may turn on, and a velocity is only compared: neither is refused, none is silent."""
+    case, path = CASES["degrees of a joint without a range, stated"], tmp_path / "run.csv"
+    path.write_bytes(case.content)
+    with pytest.warns(UserWarning, match=r"'qpos:shoulder' goes to and fro by 9.1\d turns in rad; .*unit: deg"):
+        read_logs(path, MODELS["arm"])
+    speeds = np.gradient(TRUTH[:, 3:], 0.01, axis=0)
+    path.write_text(text(np.c_[TRUTH, 30 / np.pi * speeds], HEADER + ",qvel:shoulder,qvel:elbow"))
+    with pytest.warns(UserWarning, match="qvel:shoulder is about 9.5.*`unit: rpm`"):
+        read_logs(path, MODELS["arm"])
+    whole = LogMap.read({"time": "time", **{s: {n: f"{s}:{n}" for n in names} for s, names in OWN.items()},
+                         "qvel": {n: {"column": f"qvel:{n}", "unit": "rpm"} for n in OWN["qpos"]}})  # fmt: skip
+    (log,) = read_logs(path, MODELS["arm"], whole)
+    np.testing.assert_allclose(log.qvel, speeds, atol=1e-5)
