@@ -128,6 +128,7 @@ def check_motion(
     mj_model: mujoco.MjModel,
     through: NDArray[np.bool_],
     absent: tuple[str, ...] = (),
+    declared: NDArray[np.bool_] | None = None,
 ) -> None:
     """Angles are continuous, quaternions have norm 1, commands fit the actuator. Unwraps hinges in place, warning.
 
@@ -136,6 +137,7 @@ def check_motion(
     Args:
         through: [nu], the logged command is the actuator's own and no controller's.
         absent: channels that were not measured.
+        declared: [nu], the logged command is the target of a position law that the log declares.
 
     Raises:
         UserError: jumps no joint makes, registers read with the wrong sign or unit.
@@ -146,7 +148,7 @@ def check_motion(
         if kind in ("ball", "free"):
             quat = [f"qpos:{c}" for c in channels.of_joint(joint)[-4:]]
             columns.update(zip(quat, _quaternion(table, joint, np.stack([columns[c] for c in quat], 1)).T, strict=True))
-    placed(table, columns, channels, mj_model, through, absent)
+    placed(table, columns, channels, mj_model, through, absent, declared)
     for i, (joint, kind) in enumerate(zip(channels.joints, channels.kinds, strict=True)):
         if kind in ("hinge", "slide") and mj_model.jnt_limited[i]:
             _inside(table, f"qpos:{joint}", columns[f"qpos:{joint}"], mj_model.jnt_range[i], "range", 0.5)

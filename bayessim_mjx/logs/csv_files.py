@@ -56,6 +56,8 @@ def read_csv(path: Path, form: Form | None = None) -> Table:
         lines = list(csv.reader(text, delimiter=delimiter))
     except csv.Error as error:
         raise UserError(f"{path}: not a text file ({error}); {ALLOWED}") from None
+    if delimiter == " ":
+        lines = _in_blanks(text, lines)
     while lines and not any(f.strip() for f in lines[-1]):
         lines.pop()
     body = lines[1 + form.skip_after_header :] if form.header else lines[form.skip_after_header :]
@@ -85,6 +87,17 @@ def read_csv(path: Path, form: Form | None = None) -> Table:
     blank = {names[i] for i in unnamed if not any(r[i].strip() for r in body)}
     columns = {name: column for name, column in columns.items() if name not in blank}
     return Table(path, columns, first, lenient=form.lenient, ragged=ragged, marks=marks)
+
+
+def _in_blanks(text: Sequence[str], lines: list[list[str]]) -> list[list[str]]:
+    """Columns that are set out by several blanks, and a `#` that stands alone before the names."""
+    if len({len(fields) for fields in lines if fields}) > 1:
+        split = [line.split() for line in text]
+        if split and split[0][:1] == ["#"]:
+            split[0] = split[0][1:]
+        if len({len(fields) for fields in split if fields}) == 1:
+            return split
+    return lines
 
 
 def _other_delimiter(path: Path, names: Sequence[str], lines: Sequence[Sequence[str]]) -> None:

@@ -30,12 +30,14 @@ def check_units(
     model: mujoco.MjModel,
     log_map: LogMap,
     through: NDArray[np.bool_],
+    declared: NDArray[np.bool_] | None = None,
 ) -> None:
     """Channels are in the model's units, or the map states theirs.
 
     Args:
         columns: channels [T] in the model's units, as far as the map states them.
         through: [nu], commands that go to the actuators as they are.
+        declared: [nu], targets of a position law that the log declares.
 
     Raises:
         UserError: another unit in a column's name, a unit of another kind than the joint, values that fit the joint
@@ -43,7 +45,7 @@ def check_units(
     """
     sources = {name: source for name, source, _ in log_map.channels()}
     kinds = dict(zip(channels.joints, channels.kinds, strict=True))
-    followed = dict(servos(model, through))
+    followed = dict(servos(model, through, declared))
     for name, source in sources.items():
         stream, _, own = name.partition(":")
         if source.value is None and stream in ("ctrl", "qpos", "qvel"):

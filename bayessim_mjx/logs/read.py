@@ -100,9 +100,9 @@ def _read_one(
     law = controllers.read(
         metadata, mj_model, channels.actuators, str(path)
     )  # refused here, before anything is simulated
-    through = np.asarray(law.through)
-    check_units(table, columns, channels, mj_model, log_map, through)
-    check_motion(table, columns, channels, mj_model, through, absent)
+    through, declared = np.asarray(law.through), np.asarray(law.on_position) > 0
+    check_units(table, columns, channels, mj_model, log_map, through, declared)
+    check_motion(table, columns, channels, mj_model, through, absent, declared)
     say_better_clock(table, columns, channels, log_map)
     columns = _with_numbers(table, columns)
     if "condition" in metadata:

@@ -19,13 +19,20 @@ MOST = 0.95  # share of the rows that have to agree
 NEAR = 0.25 * TURN  # rad between a reading and its target, modulo a turn
 
 
-def servos(model: mujoco.MjModel, through: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """(actuator, joint) of the hinges with a position servo whose logged command is the target, in rad."""
+def servos(
+    model: mujoco.MjModel, through: NDArray[np.bool_], declared: NDArray[np.bool_] | None = None
+) -> Iterator[tuple[int, int]]:
+    """(actuator, joint) of the hinges whose logged command is the target of a position servo, in rad.
+
+    Args:
+        through: [nu], commands that go to the actuators as they are.
+        declared: [nu], targets of a position law that the log declares.
+    """
     joint_types = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     for i in range(model.nu):
         gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, 1]
-        on_joint = int(model.actuator_trntype[i]) in joint_types and model.actuator_gear[i, 0] == 1.0
-        if on_joint and through[i] and gain > 0 and np.isclose(bias, -gain):
+        native = through[i] and model.actuator_gear[i, 0] == 1.0 and gain > 0 and np.isclose(bias, -gain)
+        if int(model.actuator_trntype[i]) in joint_types and (native or (declared is not None and declared[i])):
             joint = int(model.actuator_trnid[i, 0])
             if int(model.jnt_type[joint]) == HINGE:
                 yield i, joint
@@ -38,6 +45,7 @@ def placed(
     model: mujoco.MjModel,
     through: NDArray[np.bool_],
     absent: tuple[str, ...] = (),
+    declared: NDArray[np.bool_] | None = None,
 ) -> None:
     """Moves readings and targets of hinges by whole turns in place, with a warning that says how to state it.
 
@@ -45,13 +53,14 @@ def placed(
         columns: channels [T]; positions are unwrapped already.
         through: [nu], commands that go to the actuators as they are.
         absent: channels that were not measured.
+        declared: [nu], targets of a position law that the log declares.
 
     Raises:
         UserError: readings that are turns away from their targets for a part of the log only, or from their range in
             two ways.
     """
     followed = set()
-    for i, j in servos(model, through):
+    for i, j in servos(model, through, declared):
         reading, target = f"qpos:{channels.joints[j]}", f"ctrl:{channels.actuators[i]}"
         if reading in absent:
             continue

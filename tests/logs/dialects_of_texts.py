@@ -11,6 +11,7 @@ BYTES = "stackoverflow.com/questions/5552555: byte 0xe9 of Latin-1 read as UTF-8
 BOM = "johndcook.com/blog/2019/09/07: a byte order mark in the name of the first column"
 PAGES = "donatstudios.com/CSV-An-Encoding-Nightmare: code pages of Excel"
 MARKS = "elysiate.com/blog: number formatting in CSV, commas, decimals and locale chaos"
+SAVETXT = "numpy/numpy: savetxt writes '# ' before the names, and fields of a fixed width"
 HEADERS = "DavidMertz/DataCleaningSingapore: structural faults of delimited texts"
 
 BIG = TRUTH * np.array([1, 1, 1e3, 1, 1])  # a command in thousandths, for groups of thousands
@@ -110,6 +111,10 @@ CASES = [
          ("header: false",), True, {"header": False}),
     Case("a comma at the end of each line", HEADERS,
          ordinary("\n".join(line + "," for line in LINES) + "\n")),
+    Case("a mark of comments before the names", SAVETXT, text(TRUTH, "# " + PLAIN.replace(",", " "), " ").encode(),
+         {**SEMI, "delimiter": " "}),
+    Case("columns set out by blanks", SAVETXT, text(TRUTH, "   ".join(PLAIN.split(",")), " ", "%12.6f").encode(),
+         {**SEMI, "delimiter": " "}),
     Case("a name that comes twice", HEADERS, text(TRUTH, "t,u,u,qa,qb").encode(),
          {"time": 0, "ctrl": {"m_shoulder": 1, "m_elbow": 2}, "qpos": {"shoulder": 3, "elbow": 4}},
          ("header: false", "skip_rows: 1"), True, {"header": False, "skip_rows": 1}),

@@ -81,3 +81,18 @@ def test_units_that_nothing_proves_are_warned_of_with_their_key(tmp_path: Path) 
                          "qvel": {n: {"column": f"qvel:{n}", "unit": "rpm"} for n in OWN["qpos"]}})  # fmt: skip
     (log,) = read_logs(path, MODELS["arm"], whole)
     np.testing.assert_allclose(log.qvel, speeds, atol=1e-5)
+
+
+def test_targets_of_a_declared_law_place_the_readings_too(tmp_path: Path) -> None:
+    turned = TRUTH.copy()
+    turned[:, 1:3] = TRUTH[:, 3:]
+    turned[:, 3] += 2 * np.pi
+    (tmp_path / "run.csv").write_text(text(turned))
+    declared = {"metadata": {"controller": {"law": "position", "kp": 3.0, "limit": 2.0}}}
+    with pytest.warns(UserWarning, match=r"1 turn\(s\) from 'ctrl:m_shoulder'.*offset: -6.283185"):
+        (log,) = read_logs(tmp_path / "run.csv", MODELS["arm"], declared)
+    np.testing.assert_allclose(log.qpos, TRUTH[:, 3:], atol=2e-6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (log,) = read_logs(tmp_path / "run.csv", MODELS["arm"])  # torques say nothing of a turn
+    assert log.qpos[0, 0] > 6
