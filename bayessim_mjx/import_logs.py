@@ -1,4 +1,4 @@
-"""`bayessim-mjx logs`: `check DIR` shows what is understood of logs; `from-mcap FILE --out DIR` and others convert."""
+"""`bayessim-mjx logs`: `check DIR` shows how logs are read; `from-mcap FILE --out DIR` and others convert."""
 
 import argparse
 import errno
@@ -49,7 +49,7 @@ def _parser() -> cli.PlainParser:
 
 
 def _check(formats: Any, prog: str) -> None:
-    text = "what is understood of logs, and what is missing"
+    text = "how logs are read, and the channels that are missing"
     parser = formats.add_parser("check", help=text, description=f"Show {text}; write a map.yaml where there is none.")
     parser.usage = f"{prog} check DIR [--model FILE] [--map FILE]"
     parser.add_argument("path", metavar="DIR", help="folder of logs, or one file")
@@ -153,7 +153,7 @@ def _logs(argv: Sequence[str] | None) -> int:
 
 
 def _checked(args: argparse.Namespace) -> int:
-    """Print what was understood; exit code 0, or 2 where something is missing."""
+    """Print how the logs are read; exit code 0, or 2 where something is missing."""
     from bayessim_mjx.logs.overview import overview
 
     path = Path(args.path)

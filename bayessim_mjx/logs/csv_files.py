@@ -140,8 +140,8 @@ def _why_ragged(
     """What may be behind rows of other lengths, and the keys that mend it."""
     if delimiter == "," and len(ragged) == len(body) and all(len(fields) == 2 * len(names) for fields in body):
         return (
-            "; each row has twice as many: commas part the fields and are decimal marks too, and nothing tells them "
-            "apart; write the file with `delimiter: ';'` and `decimal: ','`, or with decimal points"
+            "; each row has twice as many: commas separate the fields and are decimal marks too, and the two cannot be "
+            "distinguished; write the file with `delimiter: ';'` and `decimal: ','`, or with decimal points"
         )
     for other, word in DELIMITERS.items():
         counts = {line.count(other) for line in text if line.strip()}

@@ -92,7 +92,7 @@ def _by_name(
         target = channels.actuators.index(own) in followed
         if target is not (unit in (*units.ANGLES, units.COUNTS)) and unit == units.COUNTS:
             return
-    text = f"{table.path}: column {column!r}: its name says {unit}, and the map says nothing of its unit"
+    text = f"{table.path}: column {column!r}: its name says {unit}, and the map does not state its unit"
     keep = "`scale: 1` in that place, if the values are in the model's unit all the same"
     raise UserError(f"{text}; allowed: {_key(name, column, str(unit))} in the map, or {keep}")
 
@@ -150,7 +150,7 @@ def _fitting(x: Array, kind: str, low: float, high: float) -> list[str]:
 
 
 def _by_target(table: Table, reading: str, target: str, columns: Mapping[str, Array]) -> None:
-    """A joint that follows its target by another amount than it was told: one of the two is in degrees."""
+    """A joint that follows its target with about 57 times its amplitude, or a 57th: one of the two is in degrees."""
     q, c = columns[reading], columns[target]
     if not (np.ptp(q) > 0 and np.ptp(c) > 0) or np.corrcoef(q, c)[0, 1] < ALIKE:
         return

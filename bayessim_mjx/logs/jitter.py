@@ -13,7 +13,7 @@ from bayessim_mjx.logs.mapping import LogMap
 from bayessim_mjx.logs.stamps import WINDOW, better_clock, coarseness
 from bayessim_mjx.logs.table import Table
 
-SURE = 1.2  # ratio of what both clocks leave, from which one is named
+SURE = 1.2  # ratio of the residuals of both clocks, from which one is named
 UNEVEN = 0.1  # share of the steps that are off by more than a fifth
 
 
@@ -37,7 +37,7 @@ def say_better_clock(table: Table, columns: Mapping[str, Array], channels: Chann
     if better == "rate" and ratio > SURE:
         text = f"{table.path}: the motion fits an even rate of {rate:.6g} rows per second better than the stamps"
         key = f"`time: {{column: ..., rate: {rate:.6g}}}` in a map takes it"
-        warnings.warn(f"{text} (they leave {ratio:.2g} times as much); {key}", stacklevel=3)
+        warnings.warn(f"{text} (the residual of the stamps is {ratio:.2g} times as large); {key}", stacklevel=3)
 
 
 def _against_stated(table: Table, time: Array, positions: Array, log_map: LogMap, rate: float) -> None:
@@ -52,9 +52,12 @@ def _against_stated(table: Table, time: Array, positions: Array, log_map: LogMap
     if ratio < SURE:
         verdict = "the motion fits both about as well; the rate is used"
     elif better == "rate":
-        verdict = f"the motion fits the rate better (the stamps leave {ratio:.2g} times as much); it is used"
+        verdict = (
+            f"the motion fits the rate better (the residual of the stamps is {ratio:.2g} times as large); it is used"
+        )
     else:
-        verdict = f"the motion fits the stamps better (the rate leaves {ratio:.2g} times as much): leave the rate out"
+        verdict = f"the motion fits the stamps better (the residual of the rate is {ratio:.2g} times as large)"
+        verdict += ": leave the rate out"
     if np.ptp(late) > 0.2 / rate:
         warnings.warn(f"{text}; {verdict}", stacklevel=4)
 

@@ -1,4 +1,4 @@
-"""What was understood of logs, as tables; a map to edit where there is none; and what is missing."""
+"""How logs are read, as tables; a map to edit where there is none; and the channels that are missing."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ CONVERTED = {".mcap": "from-mcap", ".bag": "from-rosbag", ".db3": "from-rosbag",
 
 @dataclass
 class Overview:
-    """What `bayessim-mjx logs check` prints.
+    """The output of `bayessim-mjx logs check`.
 
     Attributes:
         columns: rows (column, channel, unit, values, note) of the first file.
         files: rows (file, rows, seconds, rate, jitter, gaps) of each file.
-        notes: warnings and questions. missing: what has to be mended before the logs can be used.
+        notes: warnings and questions. missing: faults that have to be mended before the logs can be used.
         map_text: the map that was proposed, "" where there is one.
     """
 
@@ -52,7 +52,7 @@ class Overview:
 
 
 def overview(path: Path, model: mujoco.MjModel | None, map_file: str | Path | None = None) -> Overview:
-    """What is understood of a file or a folder of logs.
+    """How a file or a folder of logs is read.
 
     Args:
         path: file or folder. model: names joints and actuators; without it only columns are shown.

@@ -41,6 +41,8 @@ def form_of(path: Path) -> dict[str, Any]:
 
 
 def _table(lines: Sequence[str], mark: str) -> list[list[str]]:
+    if mark == " ":  # in runs, and `# ` may stand before the names
+        return [[part for i, part in enumerate(line.split()) if i or part != "#"] for line in lines]
     try:
         return list(csv.reader(lines, delimiter=mark))
     except csv.Error:

@@ -1,4 +1,4 @@
-"""What a controller of trajectories tells (`JointTrajectoryControllerState`): targets, output and joint states."""
+"""Messages of `JointTrajectoryControllerState` as targets, commands and joint states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Joint states that more than one publisher sent on one topic: never merged where they tell different things."""
+"""Joint states that more than one publisher sent on one topic: never merged where their positions differ."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FEW = 5  # values off the motion from which another publisher is behind them
 
 @dataclass(frozen=True)
 class _Form:
-    """What tells one publisher's messages from another's."""
+    """The features by which one publisher's messages differ from another's."""
 
     publisher: str
     frame: str
@@ -45,7 +45,7 @@ class _Form:
 def of_one_publisher(
     name: str, topic: str, messages: Sequence[Message], chosen: int | None, received: bool = False
 ) -> list[Message]:
-    """The messages of joint states of one publisher, or of several that tell the same or have no joint in common.
+    """The messages of joint states of one publisher, or of several that agree or have no joint in common.
 
     Args:
         name: of the recording; topic: of the messages.
@@ -53,7 +53,7 @@ def of_one_publisher(
         received: stamps are those of receipt.
 
     Raises:
-        UserError: two publishers of the same joints tell different things; names them and how to choose.
+        UserError: two publishers give different positions of a joint; names both, and how to choose.
     """
     forms: dict[_Form, list[Message]] = defaultdict(list)
     for message in messages:
@@ -69,7 +69,7 @@ def of_one_publisher(
     told = "; ".join(form.sentence(i, len(each)) for i, (form, each) in enumerate(ranked, 1))
     text = f"{name}: {topic} has more than one publisher: {why}"
     if len(ranked) == 1:
-        text += "; nothing in the messages tells them apart; allowed: a recording without the second publisher, another"
+        text += "; their messages cannot be distinguished; allowed: a recording without the second publisher, another"
         raise UserError(f"{text} topic by --states TOPIC, or --stamps received, if one publisher's stamps are coarse")
     raise UserError(f"{text}; choose by --publisher N ({told}), or another topic by --states TOPIC")
 
