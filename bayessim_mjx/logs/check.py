@@ -80,6 +80,9 @@ def _mend_of(time: Array) -> str:
         rate = round((len(time) - 1) / max(float(time[-1] - time[0]), 1e-9), 3)
         text = f"; the stamps are {grain:g} s apart and many rows share each, about {rate:g} rows per second"
         return f"{text}: `time: {{column: ..., rate: ROWS_PER_SECOND}}` in a map spaces them evenly"
+    lost = float(np.mean(time < np.maximum.accumulate(time)))
+    if lost > 0.05:
+        return f"; a clock that begins anew ({percent(lost)} of the rows come after it): cut the file there into two"
     return "; `bad_rows: drop` in a map leaves such rows out"
 
 

@@ -25,6 +25,7 @@ _KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "nanoseconds": ((str, int), "a header name or an index from 0, of the column with the nanoseconds"),
     "format": (str, "a form of dates as in Python's strptime, such as '%d/%m/%Y %H:%M:%S.%f'"),
     "unit": (str, "a unit"),
+    "suffix": (str, "the text behind each number, such as ' rad'"),
     "range": (list, "two different numbers, the channel at 0 % and at 100 %, such as [0.0, 0.04]"),
     "resolution": ((int, float), "counts per turn, above 0"),
     "zero": ((int, float), "a number, the raw value where the channel is 0"),

@@ -39,6 +39,7 @@ class Source:
         signed: bits of a two's complement register that was stored unsigned (16: 65535 means -1).
         sign_magnitude: the bit that holds the sign, counted from 0; those below hold the magnitude (10: 1029 means -5).
             The registers of many hobby servos are of this kind.
+        suffix: text behind each number, such as ` rad`.
         wrap: period [raw units] at which the raw value jumps; it is unwrapped.
     """
 
@@ -55,6 +56,7 @@ class Source:
     signed: int | None = None
     sign_magnitude: int | None = None
     wrap: float | None = None
+    suffix: str = ""
 
     @property
     def stated(self) -> bool:
@@ -80,7 +82,7 @@ class Source:
         if self.value is not None:
             return np.full(table.rows, float(self.value))
         name = self.name(table, where)
-        raw = self.decoded(table.numbers(name), table, name)
+        raw = self.decoded(table.numbers(name, self.suffix), table, name)
         scale, offset = self.factors()
         return scale * (raw - self.zero) + offset
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -79,13 +79,19 @@ class Table:
         rows = (r for r in np.flatnonzero(~np.isfinite(found)).tolist() if _filled(str(values[r])))
         return {row: f"column {column!r} holds {values[row]!r}" for row in rows}
 
-    def numbers(self, column: str) -> Array:
+    def numbers(self, column: str, suffix: str = "") -> Array:
         """The column as float64 [T]; blank fields are NaN. A column of words alone: true, yes, on are 1, the others 0.
+
+        Args:
+            suffix: text behind each number, such as its unit.
 
         Raises:
             UserError: a field that is no number, naming its line.
         """
         values = self.columns[column]
+        if suffix and not isinstance(values, np.ndarray):
+            bare = [v.strip().removesuffix(suffix.strip()).strip() for v in values]
+            return replace(self, columns={column: bare}).numbers(column)
         if isinstance(values, np.ndarray) and values.dtype.kind not in _NUMBERS:
             raise UserError(f"{self.path}: column {column!r} holds {values.dtype}; allowed: real numbers")
         if self.marks == _COMMAS and not isinstance(values, np.ndarray) and not any("." in v for v in values):
@@ -125,8 +131,12 @@ class Table:
         if self.marks.stated and re.search(r"\d[.,]\d", text):
             marks = f"`decimal: {self.marks.decimal!r}`, `thousands: {self.marks.thousands!r}`"
             return f"{text!r} is not a number by {marks} of the map; `thousands` is the mark between groups of three"
-        if re.search(r"\d[.,' ]\d", text):
+        if re.fullmatch(r"[+-]?[\d.,'\s]+", text):
             return f"{text!r} is not a number; `decimal` and `thousands` in a map state the marks in it (docs/logs.md)"
+        if match := re.fullmatch(r"[+-]?\d[\d.,]*(?:e[+-]?\d+)?(\s*[^\d\s.,_].*)", text):
+            return (
+                f"{text!r} has a unit behind its number; `suffix: {match[1]!r}` of the channel in a map passes over it"
+            )
         return f"{text!r} is not a number; `bad_rows: drop` or `bad_rows: nan` in a map leaves such fields out"
 
 

@@ -117,5 +117,11 @@ CASES = [
          ("line 10", "bad_rows: drop"), True, {"bad_rows": "drop"}),
     Case("a stamp that runs back", ORDER, changed(text(TRUTH), 200, "0.5,0,0,0,0").encode(), None,
          ("line 201", "strictly increasing", "bad_rows: drop"), True, {"bad_rows": "drop"}, truth=TRUTH[:199]),
+    Case("half days without AM and PM", SHEETS, stamped(dated("%I:%M:%S.%f", datetime(2026, 3, 4, 12, 59,
+         59))).encode(),
+         None, ("line 102", "begins anew", "cut the file"), True),
+    Case("two recordings in one file", ORDER,
+         text(with_column(0, np.r_[TRUTH[:100, 0], TRUTH[:100, 0]], TRUTH)).encode(), None,
+         ("line 102", "begins anew", "cut the file"), True),
     Case("names of other channels", LIES, in_unit(10, name="t"), {**NAMES, "time": "t"}, ("no column 'ua'",), True),
 ]  # fmt: skip

@@ -7,6 +7,7 @@ from dialects import HEADER, SERVO_HEADER, TRUTH, Case, servo_truth, text, with_
 
 DEGREES = "huggingface/lerobot#1259: joints in degrees or percent, the gripper always 0 to 100"
 PERCENT = "huggingface/lerobot#607: a gripper in percent of its range"
+SUFFIX = "stackoverflow.com, tag csv: numbers with their unit in the same field"
 MILLIMETRES = "TrossenRobotics/trossen_arm#57: the gripper in other units than the joints"
 COUNTS = "ROBOTIS-GIT/dynamixel-workbench#315: raw counts of one turn, or of many"
 REGISTER = "resibots/libdynamixel#64: signed positions read as unsigned"
@@ -57,6 +58,11 @@ CASES = [
     Case("degrees of a joint without a range, stated", DEGREES,
          text(with_column(3, DEG * TRUTH[:, 3], TRUTH)).encode(), arm(shoulder={"column": "qpos:shoulder",
          "unit": "deg"})),
+    Case("a unit behind each number", SUFFIX, text(TRUTH, form=lambda i, j, x: f"{x:.6f} rad" if j == 3 else f"{x:.6f}")
+         .encode(), ARM, ("suffix: ' rad'",), True, arm(shoulder={"column": "qpos:shoulder", "suffix": " rad"})),
+    Case("a degree sign behind each number", SUFFIX,
+         text(TRUTH, form=lambda i, j, x: f"{x * DEG:.6f}\u00b0" if j == 3 else f"{x:.6f}").encode(), ARM,
+         ("suffix: '\u00b0'",), True, arm(shoulder={"column": "qpos:shoulder", "suffix": "\u00b0", "unit": "deg"})),
     Case("degrees by the column's name", DEGREES, NAMED, arm(shoulder="shoulder_deg"), ("unit: deg", "scale: 1"), True,
          arm(shoulder={"column": "shoulder_deg", "unit": "deg"})),
     Case("degrees beyond the joint's range", DEGREES, servo(3, DEG * S[:, 3]), None, ("qpos:wrist", "unit: deg"), True,
