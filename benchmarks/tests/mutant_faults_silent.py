@@ -188,7 +188,7 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     (
         "an offset is turned round with the sign", f"{LOGS}/mapping.py",
-        "return self.sign * self.scale * raw + self.offset", "return self.sign * (self.scale * raw + self.offset)", MAP,
+        "return self.sign * scale, self.offset", "return self.sign * scale, self.sign * self.offset", MAP,
     ),
     (
         "the row before a gap belongs to what comes after it", f"{LOGS}/pieces.py",
