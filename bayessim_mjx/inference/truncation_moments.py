@@ -26,10 +26,8 @@ NEAREST, FARTHEST = 0.4, 5.0
 # times its standard deviation that a Gaussian may become; 2, 3 and 4 gain 6.97, 6.97 and 6.96 nats.
 # source: docs/decisions/truncation_moments.md
 WIDEST = 3.0
-GRID, STEPS = (
-    93,
-    24,
-)  # of the table: its entries, and steps of Newton and of bisection (off by 1e-7); source: that error
+# of the table: its entries, and steps of Newton and of bisection; source: the table is off by 1e-7
+GRID, STEPS = 93, 24
 # log mass inside before and after, below which a Gaussian stays as it is; -1, -2 and -5 before gain 7.65 nats each.
 # source: the problems of docs/decisions/truncation_moments.md; FAR is a rule of thumb
 OUTSIDE, FAR = -2.0, -20.0

@@ -26,7 +26,7 @@ TURNS = 6  # of noise and linear dynamics, at most, before anything is replayed;
 # standard deviations of the posterior: a shorter step to its mean ends these turns; source: rule of thumb, not counted
 NEAR = 0.3
 # step of central differences in z, prior standard deviations: damping was off by 1.1 of its standard deviations with
-# .05, by .02 with .01. source: measured at 4bef796
+# .05, by .02 with .01. source: counted on Cartpole's pole, 32 trajectories
 SLOPE = 0.01
 # longest step in z in which linear dynamics are used, prior standard deviations; source: rule of thumb, not counted
 LEAP = 1.0
