@@ -56,7 +56,8 @@ def check_names(table: Table, columns: Mapping[str, Array], channels: Channels) 
     if missing:
         names = ", ".join(table.columns)
         constant = "a joint that was not recorded can be held constant in the map (qpos: {<joint>: {value: 0.0}})"
-        raise UserError(f"{table.path}: missing column(s) {', '.join(missing)}; it has {names}; {constant}")
+        way = "`bayessim-mjx logs check DIR --model FILE` proposes a map of columns with other names"
+        raise UserError(f"{table.path}: missing column(s) {', '.join(missing)}; it has {names}; {constant}; {way}")
 
 
 def check_finite(table: Table, columns: Mapping[str, Array], channels: Channels) -> None:

@@ -133,7 +133,7 @@ def _stated(field: str, form: str, row: int, where: Where, lenient: bool) -> dat
     try:
         if field:
             return datetime.strptime(_DIGITS.sub(r"\1", field), form)
-    except ValueError:
+    except (ValueError, re.error):  # the second of a form that names a part twice
         if not lenient:
             raise UserError(f"{where(row)}: {field!r} is no time of the form {form!r} (time: format)") from None
     return None

@@ -84,7 +84,7 @@ def _fits_text(key: str, value: Any) -> bool:
     if key == "encoding":
         try:
             return bool(codecs.lookup(value)._is_text_encoding)
-        except LookupError:
+        except (LookupError, ValueError):
             return False
     return True
 

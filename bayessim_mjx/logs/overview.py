@@ -232,7 +232,9 @@ def _clock(time: Array | None, log_map: LogMap) -> tuple[str, ...]:
     gaps = steps[steps > max(MAX_GAP * step, SHORT_GAP)]
     gap = f"{len(gaps)}, longest {gaps.max():.3g} s" if len(gaps) else "none"
     rate = f"{1.0 / step:.6g} Hz" + (" (stated)" if log_map.rate or log_map.time.rate else "")
-    return f"{np.nanmax(time) - np.nanmin(time):.4g} s", rate, f"{1e3 * np.std(usual):.3g} ms", gap
+    jitter = float(np.std(usual))
+    shown = f"{1e3 * jitter:.3g} ms" if jitter > 1e-6 * step else "none"  # below, it is that of floating point
+    return f"{np.nanmax(time) - np.nanmin(time):.4g} s", rate, shown, gap
 
 
 def _read(out: Overview, files: Sequence[Path], log_map: LogMap, model: mujoco.MjModel) -> None:

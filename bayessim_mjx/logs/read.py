@@ -111,6 +111,11 @@ def _read_one(
 
 
 def table_of(path: Path, log_map: LogMap) -> Table:
+    """The columns of a file as the map says it is written.
+
+    Raises:
+        UserError: a file that cannot be read so.
+    """
     lenient = log_map.bad_rows != "error"
     if path.suffix == ".npz":
         return replace(read_npz(path), lenient=lenient)
