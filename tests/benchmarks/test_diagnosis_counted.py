@@ -166,7 +166,7 @@ def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_pat
 
     monkeypatch.setattr(command, "_begin", sleep)
     args = argparse.Namespace(
-        out=tmp_path, jobs=1, minutes=0.01, only="sheets", systems="leg", shard="1/10", more="--accuracy 5%"
+        out=tmp_path, jobs=1, minutes=0.01, only="sheets", systems="leg", shard="1/10", more="--accuracy 5%", does="run"
     )
     for _ in range(2):
         command.run(args)
