@@ -81,7 +81,7 @@ def _calibrate(argv: Sequence[str] | None) -> int:
         console.say(f"{config.task}, round {done}, {args.pairs} fresh pairs of parameters and trajectories, {run.path}")
         found = loop.reexamine(parts, tree["state"], tree["policy"], args.pairs, args.seed)
         show(console, found)
-        if text := loop.standing.told(tree["state"]):
+        if text := loop.reused_posterior(tree["state"]):
             console.warning(text)
         folder = write(run.path / FOLDER, found, done)
         console.say(f"report and picture: {folder}, and in TensorBoard under {FOLDER}")
@@ -105,7 +105,7 @@ def show(console: Any, found: Any) -> None:
 
 
 def set_rows(sets: Any) -> list[list[str]]:
-    """The table of inference.sets.Sets: each number of trajectories, and the share of truths in its regions."""
+    """Rows of the table of `product_calibration.Sets`: numbers of trajectories and shares of truths in the regions."""
     rows = []
     for near, c in [(False, c) for c in sets.counts] + [(True, c) for c in sets.near]:
         shares = [percent_estimate(c.coverage(a), (a * (1 - a) / len(c.levels)) ** 0.5) for a in LEVELS]
@@ -124,7 +124,7 @@ def verdict_lines(found: Any) -> list[str]:
     if report.predictive is not None:
         lines += [f"predictive  p = {report.predictive:.2g} that simulations at the posterior reproduce the summaries"]
     if found.sets is not None:
-        lines += [f"sets        {found.sets.told}"]
+        lines += [f"sets        {found.sets.saturation}"]
     each = "" if len(misfit.p) == 1 else f" (each: {' '.join(f'{value:.2g}' for value in misfit.p)})"
     reality = "unlike anything simulated" if misfit.flagged else "like simulated ones"
     return [*lines, f"reality     the real trajectories are {reality}, p = {misfit.joint:.2g}{each}"]

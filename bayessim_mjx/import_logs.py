@@ -1,6 +1,7 @@
-"""`bayessim-mjx logs from-mcap FILE --out DIR`: recordings of other tools as logs that the diagnosis reads."""
+"""`bayessim-mjx logs`: `check DIR` shows how logs are read; `from-mcap FILE --out DIR` and others convert."""
 
 import argparse
+import errno
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,9 +23,9 @@ FORMATS = {
 
 
 def _parser() -> cli.PlainParser:
-    text = "Convert recordings to a folder of CSV files and a map of their columns (docs/logs.md)."
+    text = "Check logs, or convert recordings to a folder of CSV files and a map of their columns (docs/logs.md)."
     prog = cli.prog_of("logs").replace("bayessim_mjx.logs", "bayessim_mjx.import_logs")
-    parser = cli.PlainParser(prog=prog, description=text, usage="%(prog)s FORMAT PATH [PATH ...] --out DIR")
+    parser = cli.PlainParser(prog=prog, description=text, usage="%(prog)s FORMAT PATH [PATH ...] [options]")
     formats = parser.add_subparsers(dest="format", metavar="FORMAT", required=True, prog=prog)
     of = {name: formats.add_parser(name, help=what, description=f"Convert {what}.") for name, what in FORMATS.items()}
     for name, each in of.items():
@@ -37,6 +38,7 @@ def _parser() -> cli.PlainParser:
         )
     for name in ("from-mcap", "from-rosbag"):
         _ros(of[name])
+    _check(formats, prog)
     of["from-lerobot"].add_argument(
         "--episodes", metavar="N", type=int, nargs="+", help="numbers of the episodes (default: all)"
     )
@@ -46,12 +48,23 @@ def _parser() -> cli.PlainParser:
     return parser
 
 
+def _check(formats: Any, prog: str) -> None:
+    text = "how logs are read, and the channels that are missing"
+    parser = formats.add_parser("check", help=text, description=f"Show {text}; write a map.yaml where there is none.")
+    parser.usage = f"{prog} check DIR [--model FILE] [--map FILE]"
+    parser.add_argument("path", metavar="DIR", help="folder of logs, or one file")
+    parser.add_argument("--model", metavar="FILE", help="MJCF model; it names joints and actuators")
+    parser.add_argument("--map", metavar="FILE", help="map of the columns (default: map.yaml in the folder)")
+
+
 def _ros(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--states", metavar="TOPIC", help="the joint states (default: the topic of that type)")
     text = "commands, for arrays with the joints in their order (default: all topics of commands)"
     parser.add_argument("--commands", metavar="TOPIC[=A,B]", nargs="+", default=[], help=text)
     text = "what is commanded, where messages have several: position, velocity or effort"
     parser.add_argument("--field", choices=("position", "velocity", "effort"), help=text)
+    text = "which publisher of the joint states, from 1, where a refusal numbers several"
+    parser.add_argument("--publisher", metavar="N", type=int, help=text)
     text = "times of headers, or when messages were received (default: header)"
     parser.add_argument("--stamps", choices=("header", "received"), default="header", help=text)
 
@@ -80,15 +93,17 @@ def _pairs(given: Sequence[str]) -> dict[str, str]:
     return dict(text.split("=", 1) for text in given)
 
 
-def _choice(args: argparse.Namespace) -> "Choice":
+def _choice(args: argparse.Namespace, model: Any) -> "Choice":
     from bayessim_mjx.logs.importers.ros import Choice
 
     topics = (text.partition("=") for text in args.commands)
     commands = {topic: [n for n in names.split(",") if n] for topic, _, names in topics}
-    return Choice(args.states, commands or None, args.field, args.stamps)
+    # the bias of a position servo pulls its joint back by the gain
+    targets = model is not None and model.nu > 0 and bool((model.actuator_biasprm[:, 1] < 0).all())
+    return Choice(args.states, commands or None, args.field, args.stamps, args.publisher, targets)
 
 
-def _recordings(args: argparse.Namespace) -> Iterator["Recording"]:
+def _recordings(args: argparse.Namespace, model: Any) -> Iterator["Recording"]:
     for path in map(Path, args.paths):
         if not path.exists():
             raise UserError(f"{path}: no such file or folder")
@@ -104,7 +119,7 @@ def _recordings(args: argparse.Namespace) -> Iterator["Recording"]:
             from bayessim_mjx.logs.importers import ros, ros_files
 
             read = ros_files.of_mcap if args.format == "from-mcap" else ros_files.of_rosbag
-            yield ros.recording(path.stem, read(path), _choice(args))
+            yield ros.recording(path.stem, read(path), _choice(args, model))
 
 
 def _arrays(args: argparse.Namespace) -> Any:
@@ -121,17 +136,65 @@ def _arrays(args: argparse.Namespace) -> Any:
 def _logs(argv: Sequence[str] | None) -> int:
     """Recordings of other tools as a folder of logs; exit code 0, or 2 (bad input)."""
     args = _parser().parse_args(argv)
+    if args.format == "check":
+        return _checked(args)
     scale, of_commands = _scales(args)
     from bayessim_mjx.logs.importers.folder import Target
 
-    target = Target(Path(args.out), _model(args.model), _pairs(args.rename), scale, of_commands)
-    written = target.write(_recordings(args))
+    model = _model(args.model)
+    target = Target(Path(args.out), model, _pairs(args.rename), scale, of_commands)
+    written = target.write(_recordings(args, model))
     for note in target.notes:
         print(note)
     print(f"{len(written)} log(s) and map.yaml in {target.folder}")
     model = args.model or "robot.xml"
     print(f"next: bayessim-mjx diagnose --model {model} --data {target.folder}")
     return 0
+
+
+def _checked(args: argparse.Namespace) -> int:
+    """Print how the logs are read; exit code 0, or 2 where something is missing."""
+    from bayessim_mjx.logs.overview import overview
+
+    path = Path(args.path)
+    found = overview(path, _model(args.model), args.map)
+    _table(("column", "channel", "unit", "values", "note"), found.columns)
+    _table(("file", "rows", "length", "rate", "jitter", "gaps"), found.files)
+    for note in found.notes:
+        print(f"note: {note}")
+    if found.map_text:
+        _write_map(path, found.map_text)
+    for what in found.missing:
+        print(f"missing: {what}")
+    if not found.missing:
+        print(f"nothing is missing; next: bayessim-mjx diagnose --model {args.model} --data {path}")
+    return 2 if found.missing else 0
+
+
+def _write_map(path: Path, text: str) -> None:
+    """Into the folder; of a single file, or where nothing may be written, onto the terminal."""
+    try:
+        if path.is_dir():
+            if not path.stat().st_mode & 0o222:  # also for an administrator, whom no mode would stop
+                raise PermissionError(errno.EACCES, "the folder is read-only")
+            with (path / "map.yaml").open("x", encoding="utf-8") as file:
+                file.write(text)
+            print(f"map: {path / 'map.yaml'} is written; edit it where it is wrong")
+            return
+        why = "a map for it, for --map"
+    except OSError as error:
+        why = f"{path / 'map.yaml'} cannot be written ({error.strerror}); a map for --map"
+    print(f"map: {why}:")
+    print("".join(f"  {line}\n" for line in text.splitlines()), end="")
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    if not rows:
+        return
+    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
+    for row in (head, *rows):
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    print()
 
 
 def _scales(args: argparse.Namespace) -> tuple[float, float]:

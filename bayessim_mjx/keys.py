@@ -8,6 +8,7 @@ import numpy as np
 from jax import Array
 
 BEYOND = 2**31  # no key is split into as many
+GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio: multiples of it are spread evenly (Knuth, TAOCP 3, 6.4)
 
 
 def branch(key: Array, number: int | Array) -> Array:
@@ -18,4 +19,4 @@ def branch(key: Array, number: int | Array) -> Array:
     return jax.random.fold_in(key, np.uint32(BEYOND) + jnp.asarray(number).astype(np.uint32))
 
 
-__all__ = ["branch"]
+__all__ = ["GOLDEN", "branch"]

@@ -12,6 +12,9 @@ import jax.numpy as jnp
 from jax import Array
 
 UNROLLED = 8  # rows
+REGRESSED = 1024  # features up to which normal equations save more time than they cost; source: rule of thumb
+ROUNDING = 1e-5  # standard deviation over mean of a column that does not vary; source: 100 times float32's resolution
+RIDGE = 1e-3  # of the features' variance; source: rule of thumb, not counted
 
 
 def product(a: Array, b: Array) -> Array:
@@ -98,3 +101,18 @@ def lower_factor(rows: Array) -> Array:
 
     start = jnp.zeros_like(rows), jnp.zeros((*rows.shape[:-1], d), rows.dtype)
     return jax.lax.fori_loop(0, d, row, start)[1]
+
+
+def ridge(design: Array, y: Array, weights: Array) -> tuple[Array, Array]:
+    """Ridge regression of y [n, d] on design [n, H] with weights [n] of 0 or 1 -> mean [d], slope [H, d]."""
+    n = jnp.maximum(jnp.sum(weights), 1.0)
+    mean = weights @ y / n
+    weighted = (design * weights[:, None]).T
+    gram = product(weighted, design) / n + RIDGE * jnp.eye(design.shape[1])
+    return mean, jnp.linalg.solve(gram, product(weighted, y - mean[None, :]) / n)
+
+
+def inverse_spread(mean: Array, sd: Array) -> Array:
+    """1 / sd of columns [D] with these means; 0 where a column varies by no more than float32's rounding."""
+    varies = sd > ROUNDING * jnp.abs(mean) + 1e-12
+    return jnp.where(varies, 1.0 / jnp.where(varies, sd, 1.0), 0.0)

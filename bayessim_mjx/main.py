@@ -30,7 +30,7 @@ COMMANDS = {  # all of them, and what each is for
     "diagnose": "what a simulator is missing, from recorded motion",
     "blind": "which missing effects a diagnosis would find on your robot",
     "gap_loop": "what a diagnosis is worth in return",
-    "logs": "logs of MCAP, ROS bags, LeRobot and HDF5, for a diagnosis",
+    "logs": "checks logs; converts MCAP, ROS bags, LeRobot, HDF5",
     "implementations": "whether MJX or MuJoCo Warp is faster here, for env.impl=auto",
     "completion": "a script by which bash, zsh or fish completes commands",
 }

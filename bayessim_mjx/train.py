@@ -35,10 +35,10 @@ SHOWN = (
 def _parser() -> cli.Parser:
     parser = cli.Parser("train", DESCRIPTION, resume=True, unused=("bayessim", "real"), but=("bayessim.policyCheckpt",))
     parser.add_argument("--randomize", action="store_true", help="draw the physics of each episode from the prior")
-    told = "draw it from the posterior of this run, with its settings; or nominal, prior, a file of Distribution.save"
-    parser.add_argument("--domain", metavar="RUN", help=told)
-    told = "train a student that imitates the policy of this run or checkpoint, instead of PPO"
-    parser.add_argument("--distil", metavar="RUN", help=told)
+    about = "draw it from the posterior of this run, with its settings; or nominal, prior, a file of Distribution.save"
+    parser.add_argument("--domain", metavar="RUN", help=about)
+    about = "train a student that imitates the policy of this run or checkpoint, instead of PPO"
+    parser.add_argument("--distil", metavar="RUN", help=about)
     parser.add_argument("--agent", choices=AGENTS, help="whose PPO trains (default: own; docs/trainers.md)")
     return parser
 

@@ -98,7 +98,7 @@ def unit_of(effect: str, slide: bool) -> str:
     return text.replace("F", force).replace("q", way)
 
 
-def told(effect: str, value: float, slide: bool = False) -> str:
+def in_words(effect: str, value: float, slide: bool = False) -> str:
     """`0.17 deg`, `3.1 N m`, `12 %`, `4.0 ms`; of a limit, one over the value."""
     amount, unit = AMOUNTS.get(effect, OTHER), unit_of(effect, slide)
     if not math.isfinite(value) or (amount.inverse and value <= 0):

@@ -57,8 +57,8 @@ def make(check: Check, bench: Bench, item: Item) -> None:
         raw, left = bench.ruler.measure(record(causes[0], bench.ruler))
         effects = [{"raw": raw, "left": left}]
     write_logs(given / "logs", bench.rig, plant, runs, bench.velocity, bench.effort, rng)
-    for cause, told in zip(plant.causes, effects, strict=True):
-        told |= {"strength": min(told["raw"], HIDDEN * told["left"]), **hidden(cause)}
+    for cause, effect in zip(plant.causes, effects, strict=True):
+        effect |= {"strength": min(effect["raw"], HIDDEN * effect["left"]), **hidden(cause)}
     truth = dataclasses.asdict(item) | {"seed": check.seed, "base": base, "effects": effects}
     salt = seal.digest(rng.bytes(32))
     code = seal.close(truth | {"salt": salt}, given, check.secret(item.index))

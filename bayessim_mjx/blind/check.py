@@ -106,10 +106,12 @@ class Check:
             atomic.write_text(path, json.dumps(own, indent=1))
             return
         before = json.loads(path.read_text())
-        other = [k for k in own if own[k] != before.get(k, own[k])]  # an earlier version had fewer
-        if other:
-            told = ", ".join(f"{k} = {before.get(k)!r}, not {own[k]!r}" for k in other)
-            raise UserError(f"--out {self.out}: a check with {told} lies there; give another folder, or the same flags")
+        differing = [k for k in own if own[k] != before.get(k, own[k])]  # an earlier version had fewer
+        if differing:
+            other = ", ".join(f"{k} = {before.get(k)!r}, not {own[k]!r}" for k in differing)
+            raise UserError(
+                f"--out {self.out}: a check with {other} lies there; give another folder, or the same flags"
+            )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

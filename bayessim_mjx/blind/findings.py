@@ -27,7 +27,7 @@ def findings(outcomes: Sequence[Outcome], own: Bench, effects: tuple[str, ...]) 
     rows = [_threshold(g, curves, singles, own) for g in own.groups(effects)]
     nulls = [o for o in outcomes if o.kind == "null" and o.said]
     unknown = [o for o in outcomes if o.kind == "unknown" and o.said]
-    told = {
+    found = {
         "cases": len(outcomes),
         "failed": sum(o.said is None for o in outcomes),
         "seconds": float(np.median([o.seconds for o in outcomes])) if outcomes else math.nan,
@@ -45,7 +45,7 @@ def findings(outcomes: Sequence[Outcome], own: Bench, effects: tuple[str, ...]) 
         "confusion": _confusion(outcomes),
         "mistaken": mistaken(singles),
     }
-    return told | {"sentences": sentences(told)}
+    return found | {"sentences": sentences(found)}
 
 
 def _threshold(group: tuple[str, str], curves: Curves, singles: Sequence[Outcome], own: Bench) -> Found:
@@ -65,7 +65,7 @@ def _threshold(group: tuple[str, str], curves: Curves, singles: Sequence[Outcome
     if pairs:
         at = [amount_at(s, pairs) for s in (middle, low, high, most)]
         found["amount"] = at[:3]
-        words = [amounts.told(effect, a, slide) for a in at]
+        words = [amounts.in_words(effect, a, slide) for a in at]
         sign = "<" if amounts.AMOUNTS.get(effect, amounts.OTHER).inverse else ">"
         found["told"] = f"{sign} {words[3]}" if found["beyond"] else words[0]
         found["interval"] = f"from {words[1]} on" if found["beyond"] else f"{words[1]} to {words[2]}"
@@ -98,8 +98,8 @@ def closure(singles: Sequence[Outcome]) -> Found:
 
 
 def _really_closed(singles: Sequence[Outcome]) -> Found:
-    told = [o.truth.get("closed") for o in singles if _all_right(o)]
-    return _spread([float(c) for c in told if c is not None])
+    closed = [o.truth.get("closed") for o in singles if _all_right(o)]
+    return _spread([float(c) for c in closed if c is not None])
 
 
 def _spread(known: Sequence[float]) -> Found:

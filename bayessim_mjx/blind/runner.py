@@ -192,14 +192,14 @@ def outcomes(check: Check, indices: range, own: Bench) -> list[Outcome]:
             continue
         if not secret.exists():
             raise UserError(f"{secret}: no such file; the truth of a finished case is gone, make the check again")
-        told = json.loads(ended.read_text())
-        seals = {str(check.seal(index)): check.seal(index).read_text(), str(ended): told["seal"]}
+        report = json.loads(ended.read_text())
+        seals = {str(check.seal(index)): check.seal(index).read_text(), str(ended): report["seal"]}
         truth = seal.opened(check.given(index), secret, seals)
         answer = next((p for p in (check.answer(index) / n for n in KEPT) if p.exists()), None)
-        said = json.loads(answer.read_text()) if answer and told["code"] == 0 else None
-        truth["closed"] = told.get("closed")
-        cpu = told.get("cpu", math.nan)
-        found.append(Outcome(check.given(index), truth, said, own.scales.drives, told["seconds"], cpu))
+        said = json.loads(answer.read_text()) if answer and report["code"] == 0 else None
+        truth["closed"] = report.get("closed")
+        cpu = report.get("cpu", math.nan)
+        found.append(Outcome(check.given(index), truth, said, own.scales.drives, report["seconds"], cpu))
     return found
 
 

@@ -23,12 +23,12 @@ RATES = (
 )
 
 
-def share(told: Mapping[str, float]) -> tuple[str, str, str]:
+def share(rate: Mapping[str, float]) -> tuple[str, str, str]:
     """(rate, its 95 % interval, of how many)."""
-    n = int(told["n"])
+    n = int(rate["n"])
     if not n:
         return MISSING, MISSING, "0"
-    return percent(told["hits"] / n), f"{percent(told['low'])} to {percent(told['high'])}", str(n)
+    return percent(rate["hits"] / n), f"{percent(rate['low'])} to {percent(rate['high'])}", str(n)
 
 
 def thresholds(found: Found) -> tuple[list[str], list[list[str]]]:

@@ -65,9 +65,9 @@ def diagnose(check: Check, index: int) -> str:
                 shutil.copy(out / name, answer / name)
     if ended.code in STOPPED:
         raise KeyboardInterrupt
-    told: dict[str, Any] = dataclasses.asdict(ended) | {"seal": check.seal(index).read_text()}
-    told["closed"] = really_closed(check, index) if ended.code == 0 else None
-    atomic.write_text(answer / EXIT, json.dumps(told))
+    report: dict[str, Any] = dataclasses.asdict(ended) | {"seal": check.seal(index).read_text()}
+    report["closed"] = really_closed(check, index) if ended.code == 0 else None
+    atomic.write_text(answer / EXIT, json.dumps(report))
     return f"exit {ended.code}"
 
 
@@ -95,10 +95,10 @@ def work(check: Check, item: Item) -> dict[str, Any]:
     started = time.perf_counter()
     try:
         make(check, bench(check), item)
-        told = diagnose(check, item.index)
+        report = diagnose(check, item.index)
     except UserError as error:
         return {"error": str(error)}
-    return {"index": item.index, "told": told, "seconds": time.perf_counter() - started}
+    return {"index": item.index, "told": report, "seconds": time.perf_counter() - started}
 
 
 def main() -> int:

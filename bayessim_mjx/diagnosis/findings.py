@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any, TypeVar
 
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
-from bayessim_mjx.diagnosis.logcheck.channels import Link
+from bayessim_mjx.diagnosis.logcheck.links import Link
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
 from bayessim_mjx.diagnosis.residual.frequency import Heard

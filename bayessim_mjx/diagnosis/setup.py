@@ -12,24 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import tolerance
-from bayessim_mjx.diagnosis.equation_error import leads
-from bayessim_mjx.diagnosis.equation_error.look import Look
+from bayessim_mjx.diagnosis.equation_error import proposals
+from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.fitting import (
     candidates,
     command_shift,
     discretisation,
-    lean,
+    integrator_choice,
     observation,
+    pruned_model,
     scales,
-    sensors,
-    stepping,
 )
-from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, finest, most_windows, seconds_of, windows_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.fitting.simulator import Simulator
-from bayessim_mjx.diagnosis.fitting.substeps import Errors
+from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
+from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck import gate, noise
 from bayessim_mjx.diagnosis.request import Request
@@ -92,7 +90,7 @@ class _Checked:
     """Logs that passed the gate, and the robot and the control period that they are compared with.
 
     Attributes:
-        robot: as it is simulated beside these logs (`lean`); dt: control period, s.
+        robot: as it is simulated beside these logs (`pruned_model`); dt: control period, s.
         period: s between rows, the median of all logs.
         look: what the logs show before any simulation; notes: warnings so far.
     """
@@ -110,13 +108,12 @@ class _Timed:
     """The robot with a time step that is fine enough, and when its commands act.
 
     Attributes:
-        gate: with logs whose commands are shifted by `lead`, s; cuts: windows by the factor on the sub-steps.
+        gate: with logs whose commands are moved (`Timing.moved`); cuts: windows by the factor on the sub-steps.
         notes: warnings that are said before the search; warnings: others.
     """
 
     robot: Robot
     gate: gate.Gate
-    lead: float
     cuts: Callable[..., Windows]
     step: discretisation.Discretisation
     notes: tuple[str, ...]
@@ -126,7 +123,7 @@ class _Timed:
         """The windows that models are fitted to."""
         steps = self.step.errors.cut.steps if self.step.errors else self.cuts(1).steps
         most = most_windows(physics, steps, quick)
-        return self.step.noisier(self.cuts(self.step.factor, limit=most, centred=False, late=self.lead))
+        return self.step.noisier(self.cuts(self.step.factor, limit=most, centred=False, late=self.gate.timing.moved))
 
 
 def prepare(
@@ -151,11 +148,11 @@ def prepare(
     size = scales.measure(checked.robot.mj_model, [resample(log, checked.dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(candidates.kinds_of(request.effects), size)
     judge = functools.partial(tolerance.judge, checked.robot.mj_model, 2 * size.travel, asked=tolerated)
-    timed = _timed(checked, size, judge(sensors.noise_of_positions(usable)).limit, request.group, budget)
+    timed = _timed(checked, size, judge(noise.noise_of_positions(usable)).limit, request.group, budget)
     physics = physics_of(timed.robot, checked.dt, stack)
     cut = timed.cut(physics, request.quick)
     base = candidates.base_coordinates(timed.robot.space, timed.robot.accuracy, timed.robot.assumed)
-    led = leads.lead(candidates.enumerate_candidates(physics), checked.look)
+    led = proposals.lead(candidates.enumerate_candidates(physics), checked.look)
     allowed = judge(cut.sigma_q)
     untried = [f"not tried: {text}" for text in left_out]
     warnings = [*checked.notes, *timed.notes, *timed.warnings, *untried, *_few_conditions(cut)]
@@ -170,7 +167,7 @@ def prepare(
         settings=dataclasses.replace(settings, believed=timed.step.believed, budget=budget),
         seed=request.seed,
         tolerance=allowed,
-        warnings=(*warnings, *sensors.not_compared(usable), *allowed.warnings(), *led.sentences()),
+        warnings=(*warnings, *noise.not_compared(usable), *allowed.warnings(), *led.sentences()),
         said=timed.notes,
         discretisation=timed.step,
         look=checked.look,
@@ -180,26 +177,26 @@ def prepare(
 def _checked(robot: Robot, logs: Sequence[Log], request: Request, looked: Callable[[Look], None]) -> _Checked:
     """The logs after the gate, cut where they begin to be usable, and their notes."""
     dt, notes = control_period(robot, logs), [*request.notes]
-    found, look = leads.checked(logs, robot, dt, notes, looked)
+    found, look = proposals.checked(logs, robot, dt, notes, looked)
     beginnings, shorter = observation.shortened(found.demand(), seconds_of(robot.mj_model.nv, request.quick))
     found = found.of_logs(observation.completed(beginnings, robot.mj_model))
     notes += [*found.warnings, *shorter, *(f"{text} (found, not assumed)" for text in found.findings)]
     notes += [] if noise.repeats(found.usable) else [noise.ONCE]
     period = float(np.median([log.period for log in logs]))
-    return _Checked(lean.lean(robot, found.usable, dt), dt, period, found, look, tuple(notes))
+    return _Checked(pruned_model.pruned(robot, found.usable, dt), dt, period, found, look, tuple(notes))
 
 
 def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | None, budget: Budget) -> _Timed:
     """How finely the simulator has to step, and how far commands are shifted; limit: `[nv]`, the tolerance."""
     usable, dt = checked.gate.usable, checked.dt
     measured = functools.partial(_measured, usable=usable, group=group, use_qvel=checked.gate.use_qvel, limit=limit)
-    steps = stepping.stepping(checked.robot, dt, usable, measured, functools.partial(_affordable, budget))
+    steps = integrator_choice.choose(checked.robot, dt, usable, measured, functools.partial(_affordable, budget))
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
-    lead, late = (0.0, []) if shift is None else (shift.lead, shift.told(checked.period))
-    shifted = checked.gate.shifted(lead) if lead else checked.gate
+    late = [] if shift is None else shift.told(checked.period)
+    clocked = checked.gate if shift is None else checked.gate.clocked(shift.behind, shift.lead)
     notes = [*steps.said(), *_faster(usable, float(checked.robot.mj_model.opt.timestep), dt), *late]
-    return _Timed(step.robot(steps.robot), shifted, lead, cuts, step, tuple(notes), tuple(steps.warnings()))
+    return _Timed(step.robot(steps.robot), clocked, cuts, step, tuple(notes), tuple(steps.warnings()))
 
 
 def _affordable(budget: Budget, seconds: float) -> bool:

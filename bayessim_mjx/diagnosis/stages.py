@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 from bayessim_mjx.diagnosis.experiment import propose
 from bayessim_mjx.diagnosis.findings import Findings, Observer, Where
-from bayessim_mjx.diagnosis.logcheck import channels
+from bayessim_mjx.diagnosis.logcheck.links import links as links_of
 from bayessim_mjx.diagnosis.residual import black_boxes, frequency, where
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.flexible import Flexible, flexible
@@ -55,7 +55,7 @@ def none_of_these(found: Findings, say: Progress) -> Findings:
     missing = estimate(setup.fitter, base.fit) if found.selection.state.above_noise(base) else None
     on_base = _flexible(found, base, missing)
     on_winner = _flexible(found, model) if model.effects else on_base
-    links = tuple(link for log in setup.logs[:1] for link in channels.links(log, setup.robot.mj_model))
+    links = tuple(link for log in setup.logs[:1] for link in links_of(log, setup.robot.mj_model, setup.gate.timing))
     return replace(found, disturbance=missing, flexible_base=on_base, flexible_winner=on_winner, links=links)
 
 

@@ -20,14 +20,13 @@ from scipy.special import ndtr
 from bayessim_mjx.distributions import Distribution, box
 from bayessim_mjx.distributions.evaluate import candidates
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference.temperature import TEMPERATURES, temperature, widened
+from bayessim_mjx.inference.temperature import LEVELS, TEMPERATURES, temperature, widened
 from bayessim_mjx.keys import branch
 from bayessim_mjx.quantities import percent, percent_estimate
 
-LEVELS = (0.5, 0.8, 0.95)
 DRAWS = 256  # proposals per pair; those outside the box are left out
-FEWEST = 15  # pairs that say anything
-ALPHA = 0.01  # chance that a calibrated posterior is called anything else
+FEWEST = 15  # pairs, at least, that a verdict needs; source: rule of thumb, not counted
+ALPHA = 0.01  # chance of another verdict on a calibrated posterior; source: a chosen level of the tests
 CALIBRATED, OVER, UNDER, BIASED, ODD = "calibrated", "over-confident", "under-confident", "biased", "miscalibrated"
 
 
@@ -84,7 +83,7 @@ def _rank(key: Array, draws: Array, value: Array, kept: Array) -> Array:
 
 @dataclass(frozen=True)
 class Report:
-    """What the held-out pairs say of a posterior; arrays on the host."""
+    """Calibration of a posterior on held-out pairs; arrays on the host."""
 
     names: tuple[str, ...]
     verdict: str  # calibrated, over-confident, under-confident, biased, miscalibrated

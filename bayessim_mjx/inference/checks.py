@@ -1,4 +1,4 @@
-"""What is asked of every inference: is it calibrated, does reality look like simulation, what was identified."""
+"""Checks of every inference: calibration, likeness of reality and simulation, identified parameters."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from bayessim_mjx.inference.calibration import Report
 from bayessim_mjx.inference.fit import condition
 from bayessim_mjx.inference.identify import flat_sentences, restore_prior
 from bayessim_mjx.inference.misspecification import Misfit
+from bayessim_mjx.inference.product_calibration import Sets
 from bayessim_mjx.inference.range_ends import Pile, piles
-from bayessim_mjx.inference.sets import Sets
 from bayessim_mjx.inference.temperature import widened
 from bayessim_mjx.quantities import percent, percent_estimate
 
-CANDIDATES = 16  # draws of q for each one of q tilt / prior
+CANDIDATES = 16  # draws of q for each one of q tilt / prior; source: cost alone
 
 
 @dataclass(frozen=True)
@@ -55,32 +55,32 @@ class Checks:
             f"real trajectories {reality}, p = {self.misfit.joint:.2g}"
         )
 
-    def warnings(self, told: Sequence[str] = (), refined: bool = False) -> list[str]:
-        """What a person should act on; of the parameters `told` it is known already that they are not identified.
+    def warnings(self, known: Sequence[str] = (), refined: bool = False) -> list[str]:
+        """Warnings that a person should act on; an earlier one said that the `known` parameters are not identified.
 
         Where the posterior is `refined`, that of the network was only a beginning and its faults are not the answer's.
         """
-        texts = [text for text in self.flat if text.split(":")[0] not in told]
+        texts = [text for text in self.flat if text.split(":")[0] not in known]
         if self.calibration.verdict != calibration.CALIBRATED and not refined:
             texts.append(f"posterior {self.calibration.words}: simulate more (bayessim.trainTrajs)")
         if self.misfit.flagged:
             share = f"; {percent(self.prior_share)} of the randomisation is drawn from the prior"
             texts.append(self.misfit.sentence() + (share if self.prior_share else ""))
         if self.sets is not None and self.sets.off and not refined:
-            told = ", ".join(f"its {percent(a)} region holds {percent_estimate(c, e)}" for a, c, e in self.sets.off)
+            regions = ", ".join(f"its {percent(a)} region holds {percent_estimate(c, e)}" for a, c, e in self.sets.off)
             n = self.sets.counts[-1].trajectories
-            texts.append(f"the posterior of {n} trajectories is over-confident as used: {told} of true parameters")
+            texts.append(f"the posterior of {n} trajectories is over-confident as used: {regions} of true parameters")
         return texts + [pile.sentence() for pile in self.piles]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
         misfit = {"p": self.misfit.joint, "trajectories": self.misfit.p.tolist(), "sentence": self.misfit.sentence()}
         walls = [pile.to_dict() for pile in self.piles]
-        told = {
+        values = {
             "calibration": self.calibration.to_dict(), "misfit": misfit, "walls": walls, "flat": list(self.flat),
             "prior_share": self.prior_share,
         }  # fmt: skip
-        return told if self.sets is None else {**told, "sets": self.sets.to_dict()}
+        return values if self.sets is None else {**values, "sets": self.sets.to_dict()}
 
 
 def examine(

@@ -12,17 +12,20 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution, charts, evaluate
-from bayessim_mjx.inference import coverage_factor, identify, mdn, uncut
-from bayessim_mjx.inference.data import Data
+from bayessim_mjx.inference import identify, mdn, temperature, truncation_moments
 from bayessim_mjx.inference.settings import InferenceSettings
-from bayessim_mjx.inference.state import FitState
+from bayessim_mjx.inference.state import Data, FitState
 from bayessim_mjx.inference.train import objective_of
 
 SCORED = 256  # validation rows for which the truncated density is reported
-SHARPNESS = np.geomspace(0.35, 4.0, 21).astype(np.float32)  # of the parts, tried on the held-out rows
-WORTH = 2.0  # nats, over all held-out rows, that another choice of a part has to gain: with few rows the best is luck
-CLIMBS, SWEEPS = 50, 2  # steps towards the parts' weights; rounds of choosing them
-BEYOND = -1e4  # log mass inside the box from which on float32 no longer tells a density to a thousandth
+# sharpnesses of the parts that are tried on held-out rows; before there were several of each member, regions of
+# BayesSimIG's *fixed* held .738 .899 .976. source: benchmarks/history.md, posteriors; the range is a rule of thumb
+SHARPNESS = np.geomspace(0.35, 4.0, 21).astype(np.float32)
+# nats over all held-out rows that another choice of a part has to gain: with a hundred rows the best of many is luck.
+# source: benchmarks/history.md, posteriors
+WORTH = 2.0
+CLIMBS, SWEEPS = 50, 2  # steps towards the parts' weights; rounds of choosing them; source: rule of thumb, not counted
+BEYOND = -1e4  # log mass inside the box: float32 resolves 1e-3 there; source: 24 bits of float32
 
 
 def posteriors(state: FitState, z: Array) -> Distribution:
@@ -43,7 +46,7 @@ def mixtures(state: FitState, z: Array) -> mdn.Heads:
     d, settings = len(state.space), state.settings
     each = jax.vmap(lambda params: mdn.mixture(params, z, d, settings))(parts(state.params))
     found = joined(each, state.params["share"])
-    return uncut.weighed(*found)[:3] if settings.coordinates == "matched" else found
+    return truncation_moments.weighed(*found)[:3] if settings.coordinates == "matched" else found
 
 
 def parts(params: Any) -> Any:
@@ -53,7 +56,7 @@ def parts(params: Any) -> Any:
 
 
 def heads(params: Any, data: Data, settings: InferenceSettings) -> mdn.Heads:
-    """What each member makes of the held-out rows, as it is by itself: leaves [E, V, K, ...].
+    """Outputs of each member by itself on the held-out rows: leaves [E, V, K, ...].
 
     All that follows training is computed from it: each forward pass would be compiled once more.
     """
@@ -130,13 +133,13 @@ def as_deep(state: FitState, data: Data, members: mdn.Heads) -> FitState:
     together: a network that is too wide for what it tells may be just right for the others, of which it makes flat
     Gaussians. So it is judged as it is used, with the prior where state.identified has nothing.
     """
-    most, settings, share, keep = coverage_factor.MOST, state.settings, state.params["share"], state.identified
+    most, settings, share, keep = temperature.MOST, state.settings, state.params["share"], state.identified
     centre, sd = (np.float32(v) for v in charts.SCORE[settings.chart])
     own = parts_of(jax.tree.map(lambda leaf: leaf[:, :most], members), state.params)
     logits, means, scales = joined(mdn.converted(own, settings), share)
     inside, learnt = None, (means, scales)
     if settings.coordinates == "matched":  # masses are long to compute: those of other factors are taken to be the same
-        logits, _, _, inside = uncut.weighed(logits, means, scales)
+        logits, _, _, inside = truncation_moments.weighed(logits, means, scales)
     means, scales = identify.beside_prior(means, scales, keep, settings.chart)
 
     def at(factor: Array) -> mdn.Heads:
@@ -144,13 +147,13 @@ def as_deep(state: FitState, data: Data, members: mdn.Heads) -> FitState:
             weights, centres, widths = joined(mdn.converted(mdn.sharper(own, factor), settings), share)
             return weights, *identify.beside_prior(centres, widths, keep, settings.chart)
         if inside is not None:
-            before_cut = uncut.shapes(learnt[0], learnt[1] / factor)
+            before_cut = truncation_moments.shapes(learnt[0], learnt[1] / factor)
             return logits, *identify.beside_prior(*before_cut, keep, settings.chart)
         return logits, means, scales / jnp.where(keep, factor, 1.0)[None, None, :, None]
 
     mask, truth = data.mask[:most], data.y[data.held[:most]] * sd + centre
     # the same draws in every fit: weights that are kept keep their factor
-    factor = coverage_factor.factor(jax.random.PRNGKey(0), at, truth, mask, keep, settings.chart, inside)
+    factor = temperature.coverage_factor(jax.random.PRNGKey(0), at, truth, mask, keep, settings.chart, inside)
     return replace(state, params={**state.params, "sharpness": state.params["sharpness"] * factor})
 
 

@@ -5,6 +5,7 @@ Arrays are padded to a capacity and the number of rows is traced: a growing data
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
@@ -17,13 +18,14 @@ from jax import Array
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import ensemble, identify, mdn, whitening
-from bayessim_mjx.inference.data import Again, Data, prepare
 from bayessim_mjx.inference.settings import InferenceSettings
-from bayessim_mjx.inference.state import FitInfo, FitState, rotated
+from bayessim_mjx.inference.state import Again, Data, FitInfo, FitState, prepare, rotated
 from bayessim_mjx.inference.train import MEMBERS, train
 
-LADDER = 1  # power of the members' places that their dropout rises with
-FEW = 3000  # rows up to which dropout is as set; with more it falls in proportion: many need none
+LADDER = 1  # power of the members' places that their dropout rises with; source: benchmarks/history.md, graded dropout
+# rows up to which dropout is as set; with more it falls in proportion: the pendulum gains 7.27 -> 7.31 nats,
+# BayesSimIG's *random* 3.72 -> 3.79. source: benchmarks/history.md, posteriors
+FEW = 3000
 
 
 @lru_cache
@@ -167,14 +169,14 @@ def _fit(
         state = ensemble.as_deep(state, data, members)
         own = ensemble.parts_of(members, state.params)
         mixture = ensemble.joined(mdn.converted(own, settings), state.params["share"])
-    told = {"parameter_gain": parameter_gain, "clipped": clipped, "n_invalid": n_invalid}
-    told |= {"steps": steps[0], "best": jnp.max(best), "skipped": jnp.sum(skipped)}
-    told |= ensemble.truncated_scores(state, data, thetas, own, mixture)
+    scores = {"parameter_gain": parameter_gain, "clipped": clipped, "n_invalid": n_invalid}
+    scores |= {"steps": steps[0], "best": jnp.max(best), "skipped": jnp.sum(skipped)}
+    scores |= ensemble.truncated_scores(state, data, thetas, own, mixture)
     gain = ensemble.average(ensemble.held_out(own, state.params["share"], data, settings), data.mask)
-    return state, _info(state, data, gain, curves, told)
+    return state, _info(state, data, gain, curves, scores)
 
 
-def _info(state: FitState, data: Data, gain: Array, curves: Array, told: dict[str, Array]) -> FitInfo:
+def _info(state: FitState, data: Data, gain: Array, curves: Array, scores: dict[str, Array]) -> FitInfo:
     """The scores of a fit, from its curves [E, 2, P] and its mean log density of y."""
     # densities of y -> densities of u; the same for every weight
     volume = jnp.sum(jnp.where(data.train, data.slopes, 0.0)) / jnp.maximum(jnp.sum(data.train.astype(jnp.float32)), 1)
@@ -186,7 +188,7 @@ def _info(state: FitState, data: Data, gain: Array, curves: Array, told: dict[st
         identified=state.identified,
         n_train=jnp.sum(data.train.astype(jnp.int32)),
         n_val=jnp.sum(data.mask).astype(jnp.int32),
-        **told,
+        **scores,
     )
 
 
@@ -211,3 +213,25 @@ def _bases(state: FitState, data: Data) -> Array:
     if tried > 2 and state.settings.restandardise:
         kept = jnp.where(whitening.is_padded(kept), found[-1], kept)
     return jnp.where(state.fits == 0, found, kept[None])
+
+
+def combine(posteriors: Distribution | Sequence[Distribution], components: int | None = None) -> Distribution:
+    """Posterior given all trajectories: p(theta)^(1-n) prod_i q(theta | x_i), with K = `components` Gaussians.
+
+    `posteriors` is a list, or a batched Distribution as `condition` returns it. The trajectories are taken to be
+    independent given theta.
+    """
+    items = posteriors.split() if isinstance(posteriors, Distribution) else list(posteriors)
+    if not items:
+        raise ValueError("combine: no posterior given; at least one trajectory is needed")
+    if len(items) == 1 and components in (None, items[0].components):
+        return items[0]
+    return items[0].product(*items[1:], components=components)
+
+
+def infer(state: FitState, x: Array, components: int | None = None) -> Distribution:
+    """One posterior from the summaries x [n, D] of n real trajectories; ValueError on values that are not finite."""
+    bad = np.flatnonzero(~np.all(np.isfinite(np.asarray(x)), axis=-1))
+    if bad.size:
+        raise UserError(f"the summary of real trajectory {bad[0]} holds values that are not finite")
+    return combine(condition(state, jnp.asarray(x)), components)

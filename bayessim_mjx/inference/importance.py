@@ -2,7 +2,7 @@
 
 Draws of all rounds are weighted by the mixture of all that they were drawn from (Cornuet et al. 2012, AMIS). While the
 proposal is far off, the likelihood is tempered so that enough draws count (Beskos et al. 2016) and the next proposal is
-fitted to those. What it has not reached by then, sequential Monte Carlo does (moves.py), which also finds out
+fitted to those. What it has not reached by then, sequential Monte Carlo does (smc.py), which also finds out
 whether the draws are the posterior's.
 
 Importance sampling is in probit coordinates z, in which the prior is N(0, I), moves and the answer in the unit cube.
@@ -21,27 +21,28 @@ from scipy.stats import multivariate_t
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.distributions.charts import EDGE, to_chart
-from bayessim_mjx.inference.independent import independent
-from bayessim_mjx.inference.moves import KEPT, Population, begun, moved, powered, tempering
-from bayessim_mjx.inference.pareto import normalised
-from bayessim_mjx.inference.weighted import Mixture, fitted, fitted_to_islands, in_cube
+from bayessim_mjx.inference import smc
+from bayessim_mjx.inference.final_importance_sampling import FREEDOM, WIDER, final_importance_sampling
+from bayessim_mjx.inference.mixture_fit import Mixture, fitted, fitted_to_islands, in_cube
+from bayessim_mjx.inference.smc import KEPT, ParticleState, normalised, powered, tempering
 
 LogLikelihood = Callable[[np.ndarray], np.ndarray]  # theta [N, d] -> [N]; not finite: impossible
 
-DEFENSIVE = 0.1  # share of the draws that come from the prior, whatever was learnt (Hesterberg 1995)
-FREEDOM = 5.0  # degrees of freedom of the proposals: their tails are heavier than a posterior's
-WIDER = 1.2  # standard deviations of a fitted proposal, times
+# share of draws from the prior, whatever was learnt; source: rule of thumb, method of Hesterberg 1995
+DEFENSIVE = 0.1
+ROUNDS, MOVES = 4, 96  # of importance sampling and of moves after it, at most; source: cost alone
+ENOUGH = 150.0  # independent draws that a posterior needs, of the worst parameter; source: rule of thumb, not counted
 
 
 @dataclass(frozen=True)
 class Refined:
-    """What importance sampling and moves found.
+    """Result of importance sampling and moves.
 
     Attributes:
         posterior: `fitted`, or the proposal where `reason` is not None.
         fitted: a mixture of Gaussians fitted to draws of the posterior.
         population: these draws, in the unit cube; None where no simulation has a finite likelihood.
-        effective: how many independent draws they are worth.
+        effective: their effective sample size.
         simulations: how many thetas were simulated.
         theta: the most likely theta that was simulated [d].
         reason: why the proposal was kept, or None.
@@ -50,7 +51,7 @@ class Refined:
 
     posterior: Distribution
     fitted: Distribution
-    population: Population | None
+    population: ParticleState | None
     effective: float
     simulations: int
     theta: np.ndarray
@@ -88,10 +89,10 @@ def refine(
     *,
     seed: int = 0,
     draws: int = 1024,
-    rounds: int = 4,
-    moves: int = 96,
+    rounds: int = ROUNDS,
+    moves: int = MOVES,
     components: int = 8,
-    enough: float = 150.0,
+    enough: float = ENOUGH,
     also: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Refined:
     """The posterior prior x likelihood, found from `proposal`.
@@ -116,19 +117,19 @@ def refine(
     if not np.isfinite(near.like).any():
         reason = f"none of {len(near.z)} simulations has a finite likelihood"
         return Refined(proposal, proposal, None, 0.0, len(near.z), np.asarray(proposal.mode()), reason)
-    start = begun(rng, ndtr(near.z), near.like, near.base, draws)
-    found = moved(rng, lambda u: log_likelihood(thetas(space, u)), start, enough, moves)
+    start = smc.init(rng, ndtr(near.z), near.like, near.base, draws)
+    found = smc.run(rng, lambda u: log_likelihood(thetas(space, u)), start, enough, moves)
     return _answer(rng, proposal, found, components, enough, len(near.z))
 
 
 def tempered(
     found: Refined, proposal: Distribution, log_likelihood: LogLikelihood, power: float,
-    *, moves: int = 48, components: int = 8, enough: float = 150.0, seed: int = 0,
+    *, moves: int = MOVES // 2, components: int = 8, enough: float = ENOUGH, seed: int = 0,
 ) -> Refined:  # fmt: skip
     """The same with the likelihood to a power, a generalised posterior (Bissiri et al. 2016)."""
     assert found.population is not None
     rng, space = np.random.default_rng(seed), proposal.space
-    at = moved(rng, lambda u: log_likelihood(thetas(space, u)), found.population, enough, moves, power)
+    at = smc.run(rng, lambda u: log_likelihood(thetas(space, u)), found.population, enough, moves, power)
     return _answer(rng, proposal, at, components, enough, found.simulations - found.population.simulations, power)
 
 
@@ -136,7 +137,7 @@ def sharpened(
     found: Refined, proposal: Distribution, log_likelihood: LogLikelihood,
     *, draws: int = 1024, components: int = 8, power: float = 1.0, seed: int = 0,
 ) -> Refined:  # fmt: skip
-    """`found` with Gaussians fitted to independent draws of the same posterior, where these are worth more.
+    """`found` with Gaussians fitted to independent draws, where the effective sample size of these is larger.
 
     Args:
         found: as `refine` (power 1) or `tempered` left it.
@@ -148,10 +149,12 @@ def sharpened(
         return found
     rng, space = np.random.default_rng(seed), proposal.space
     q = fitted_to_islands(rng, found.population.islands, components)
-    drawn = independent(rng, q, lambda u: power * np.asarray(log_likelihood(thetas(space, u)), np.float64), draws)
-    if drawn is None or drawn.worth <= found.effective:
+    drawn = final_importance_sampling(
+        rng, q, lambda u: power * np.asarray(log_likelihood(thetas(space, u)), np.float64), draws
+    )
+    if drawn is None or drawn.ess <= found.effective:
         return found
-    u, weights, count = drawn.u, drawn.weights, drawn.worth
+    u, weights, count = drawn.u, drawn.weights, drawn.ess
     chart = "plain" if proposal.chart == "plain" else "probit"
     z = np.asarray(to_chart(jnp.asarray(u), chart), np.float64)
     fit = _mixture(space, chart, lambda own: fitted(rng, z[:, own], weights, components), z, count, weights)
@@ -180,18 +183,18 @@ def _near(
 
 
 def _answer(
-    rng: np.random.Generator, proposal: Distribution, at: Population, components: int, enough: float, before: int,
+    rng: np.random.Generator, proposal: Distribution, at: ParticleState, components: int, enough: float, before: int,
     power: float = 1.0,
 ) -> Refined:  # fmt: skip
-    """What the population says, if its islands agree."""
+    """The result of the particles, if their islands agree."""
     chart = "plain" if proposal.chart == "plain" else "probit"
     draws = np.asarray(to_chart(jnp.asarray(at.islands), chart), np.float64)
-    every, count = draws.reshape(-1, draws.shape[-1]), max(at.worth, 1.0)
+    every, count = draws.reshape(-1, draws.shape[-1]), max(at.ess, 1.0)
     fit = _mixture(proposal.space, chart, lambda own: fitted_to_islands(rng, draws[..., own], components), every, count)
     simulations, missing = before + at.simulations, at.missing(enough, power)
     reason = missing and f"{missing}, after {simulations} simulations"
     best = thetas(proposal.space, at.u[np.argmax(at.like)][None])[0]
-    return Refined(proposal if reason else fit, fit, at, at.worth, simulations, best, reason)
+    return Refined(proposal if reason else fit, fit, at, at.ess, simulations, best, reason)
 
 
 def _mixture(

@@ -1,4 +1,4 @@
-"""Where a posterior piles up at the end of a parameter's range: the truth probably lies beyond it.
+"""Ends of ranges at which a posterior piles up: the truth probably lies beyond them.
 
 The range can then move (compare EDGE, Kamaras et al. 2025, arXiv 2510.26656, which moves the support to where the mode
 goes). Here it only grows, so that the prior over it, restricted to the range before, is the prior of before: what was
@@ -18,10 +18,11 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.parameters.ranged import Ranged
 from bayessim_mjx.quantities import percent
 
-OUTER = 0.05  # of the range, in unit coordinates: mass of the prior that lies there
-PILED = 0.25  # mass of the posterior that does not get there by chance
-STEEPEST = 0.1  # of a limit above 0: nearer to 0 it does not move at once, and so never reaches it
-LEAST = 0.05  # of a range's width: a smaller move is none
+OUTER = 0.05  # of the range, in unit coordinates: mass of the prior that lies there; source: rule of thumb, not counted
+PILED = 0.25  # mass of the posterior there, five times that of the prior; source: rule of thumb, not counted
+# of a limit above 0: it comes ten times nearer to 0 in a round at most; source: rule of thumb, not counted
+STEEPEST = 0.1
+LEAST = 0.05  # of a range's width: a smaller move counts as none; source: rule of thumb, not counted
 
 
 @dataclass(frozen=True)
@@ -44,17 +45,17 @@ class Pile:
 
     def sentence(self) -> str:
         side, way = ("upper", "raise") if self.upper else ("lower", "reduce")
-        told = f"{self.name}: {percent(self.mass)} of the posterior lies at the {side} end of its range; "
+        text = f"{self.name}: {percent(self.mass)} of the posterior lies at the {side} end of its range; "
         if self.moved is None:
-            return told + f"{way} its limit {self.limit:.4g} if that is physically possible"
+            return text + f"{way} its limit {self.limit:.4g} if that is physically possible"
         if self.moved == self.limit:
-            return told + f"its limit {self.limit:.4g} stays: nothing beyond it can be simulated"
-        return told + f"its limit moves from {self.limit:.4g} to {self.moved:.4g}"
+            return text + f"its limit {self.limit:.4g} stays: nothing beyond it can be simulated"
+        return text + f"its limit moves from {self.limit:.4g} to {self.moved:.4g}"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
-        told = {"name": self.name, "upper": self.upper, "mass": self.mass, "limit": self.limit}
-        return told if self.moved is None else {**told, "moved": self.moved}
+        values = {"name": self.name, "upper": self.upper, "mass": self.mass, "limit": self.limit}
+        return values if self.moved is None else {**values, "moved": self.moved}
 
 
 def piles(posterior: Distribution) -> list[Pile]:
@@ -79,7 +80,7 @@ def moved(space: Ranged, found: Sequence[Pile], lowest: np.ndarray, highest: np.
     Widths of a log-uniform prior are those of the logarithm. Physics ends at lowest, highest [d].
     """
     low, high = np.array(space.low, np.float64), np.array(space.high, np.float64)
-    told = []
+    new = []
     for pile in found:
         i = space.index(pile.name)
         log = space.parameters[i].prior == "loguniform"
@@ -87,11 +88,11 @@ def moved(space: Ranged, found: Sequence[Pile], lowest: np.ndarray, highest: np.
         scale = np.log if log else np.asarray
         way = (scale(grown) - scale(pile.limit)) * (1 if pile.upper else -1)
         far = way >= LEAST * (scale(high[i]) - scale(low[i]))
-        told.append(replace(pile, moved=float(np.float32(grown)) if far else pile.limit))
-    for pile in told:
+        new.append(replace(pile, moved=float(np.float32(grown)) if far else pile.limit))
+    for pile in new:
         assert pile.moved is not None
         (high if pile.upper else low)[space.index(pile.name)] = pile.moved
-    return Ranged(space.start, low, high), told
+    return Ranged(space.start, low, high), new
 
 
 def _grown(upper: bool, low: float, high: float, log: bool) -> float:

@@ -16,18 +16,28 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jax.scipy.special import ndtr, ndtri
+from scipy.stats import chi2
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import ensemble, region
+from bayessim_mjx.distributions.charts import EDGE, from_chart, to_chart
+from bayessim_mjx.inference import ensemble
 from bayessim_mjx.inference.fit import FitInfo, FitState, condition, fit, init
 from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
-LONGEST = 512  # features of a summary up to which they are pooled too: a choice, others were not measured
+LONGEST = 512  # features of a summary up to which they are pooled too; source: a choice, others were not measured
 AT_ONCE = 1024  # trajectories embedded at once, for the memory
 
 Simulate = Callable[[Array, Array], Array]  # key, theta [m, d] -> summaries [m, D]
+MASS = 1e-3  # of a Gaussian that an ellipsoid leaves outside before it is widened; source: as `rounds.MASS`
+# standard deviations, times: with the posterior itself as region, its ends would look like knowledge.
+# source: a choice, others were not measured
+WIDER = 2.0
+POOL = 4096  # draws behind its mean and covariance
+STEPS = 32  # of a walk, times the number of parameters; source: a choice, others were not measured
 
 
 @dataclass(frozen=True)
@@ -77,8 +87,8 @@ def learn(
         sets: how many are simulated.
     """
     k_theta, k_init, k_fit, *keys = jax.random.split(key, 3 + trajectories)
-    y, mean, scale = region.draw(k_theta, near, sets)
-    thetas = region.theta(near, mean + product(y, scale.T))
+    y, mean, scale = draw_region(k_theta, near, sets)
+    thetas = theta_at(near, mean + product(y, scale.T))
     features = pooled(network, (simulate(k, thetas) for k in keys))
     settings = replace(network.settings, embedding=None, coordinates="plain", restandardise=False)
     # the same space for every region: nothing is compiled again
@@ -123,7 +133,7 @@ def _pool(network: FitState, x: Array) -> _Pool:
 
 
 def _embedded(network: FitState, x: Array) -> _Pool:
-    """Of one summary [D]: the Gaussian that has the moments of its posterior, in the chart of the network."""
+    """The Gaussian with the moments of the posterior of one summary [D], in the chart of the network."""
     z = network.inputs(x[None])
     logits, means, scales = (leaf[0] for leaf in ensemble.mixtures(network, z))
     root = jnp.sqrt(jax.nn.softmax(logits))
@@ -134,4 +144,74 @@ def _embedded(network: FitState, x: Array) -> _Pool:
     return _Pool(half.T @ (half @ mean), lower_factor(half.T), z[0])
 
 
-__all__ = ["SetNetwork", "learn", "pooled"]
+def draw_region(key: Array, near: Distribution, count: int, wider: float = WIDER) -> tuple[Array, Array, Array]:
+    """Draws of the prior within the ellipsoid of the chart's coordinates mean + scale y, |y| < 1.
+
+    By hit-and-run from draws of `near` (Smith 1984): along a random direction anywhere within the ellipsoid and the
+    box, both convex, by the prior. Rejection would find hardly any with ten parameters.
+
+    Args:
+        key: consumed.
+        near: a posterior in plain or probit coordinates; its share of the prior is left out.
+        count: of draws.
+        wider: factor on its standard deviations.
+
+    Returns:
+        y [count, d], mean [d], scale [d, d] lower triangular.
+    """
+    radius = wider * float(np.sqrt(chi2.ppf(1 - MASS, len(near.names))))
+    return _draw_region(key, replace(near, prior_weight=jnp.zeros_like(near.prior_weight)), radius, count)
+
+
+@partial(jax.jit, static_argnames="count")
+def _draw_region(key: Array, near: Distribution, radius: Array, count: int) -> tuple[Array, Array, Array]:
+    k_pool, k_walk = jax.random.split(key)
+    theta = near.sample(k_pool, max(POOL, count))
+    z = to_chart(jnp.clip(jax.vmap(near.space.to_unit)(theta), EDGE, 1 - EDGE), near.chart)
+    mean, d = jnp.mean(z, axis=0), z.shape[1]
+    away = z - mean[None, :]
+    scale = radius * jnp.linalg.cholesky(product(away.T, away) / len(z) + 1e-12 * jnp.eye(d))
+    y = product(away[:count], inverse_lower(scale).T)
+    y = y * jnp.minimum(1.0, 0.99 / jnp.maximum(jnp.linalg.norm(y, axis=1, keepdims=True), 1e-9))
+
+    def step(y: Array, key: Array) -> tuple[Array, None]:
+        k_way, k_far = jax.random.split(key)
+        way = jax.random.normal(k_way, y.shape)
+        way = way / jnp.linalg.norm(way, axis=1, keepdims=True)
+        low, high = _chord(y, way, mean, scale, near.chart)
+        far = jax.random.uniform(k_far, (count,), minval=1e-6, maxval=1 - 1e-6)
+        if near.chart == "plain":
+            return y + (low + far * (high - low))[:, None] * way, None
+        moved = product(way, scale.T)
+        size = jnp.linalg.norm(moved, axis=1)  # along the way the prior is N(middle, 1 / size)
+        middle = -jnp.sum(moved * (mean + product(y, scale.T)), axis=1) / size**2
+        a, b = ndtr((low - middle) * size), ndtr((high - middle) * size)
+        by = middle + ndtri(jnp.clip(a + far * (b - a), 1e-7, 1 - 1e-7)) / size
+        return y + jnp.clip(by, low, high)[:, None] * way, None
+
+    y, _ = jax.lax.scan(step, y, jax.random.split(k_walk, STEPS * d))
+    return y, mean, scale
+
+
+def _chord(y: Array, way: Array, mean: Array, scale: Array, chart: str) -> tuple[Array, Array]:
+    """Distances back and forth along `way` [n, d] from y [n, d] to the ends of the ball and, if plain, the cube."""
+    along = jnp.sum(y * way, axis=1)
+    half = jnp.sqrt(jnp.maximum(along**2 + 1 - jnp.sum(y**2, axis=1), 0.0))
+    low, high = -along - half, -along + half
+    if chart != "plain":
+        return low, high
+    z, by = mean + product(y, scale.T), product(way, scale.T)
+    by = jnp.where(jnp.abs(by) < 1e-12, 1e-12, by)
+    ends = jnp.stack([-z / by, (1 - z) / by])
+    low = jnp.maximum(low, jnp.max(jnp.min(ends, axis=0), axis=1))
+    high = jnp.minimum(high, jnp.min(jnp.max(ends, axis=0), axis=1))
+    return jnp.minimum(low, 0.0), jnp.maximum(high, 0.0)
+
+
+def theta_at(near: Distribution, z: Array) -> Array:
+    """theta [N, d] at coordinates z [N, d] of the chart."""
+    u = jnp.clip(from_chart(z, near.chart), 0.0, 1.0)
+    return jnp.clip(jax.vmap(near.space.from_unit)(u), jnp.asarray(near.space.low), jnp.asarray(near.space.high))
+
+
+__all__ = ["SetNetwork", "draw_region", "learn", "pooled", "theta_at"]

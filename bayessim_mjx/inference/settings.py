@@ -20,7 +20,7 @@ def _of_run(name: str) -> Any:
 
 @dataclass(frozen=True)
 class InferenceSettings(Section):
-    """Those that `bayessim:` has too (config/settings.py) have its defaults and limits.
+    """Settings of the network; those that `bayessim:` has too (config/settings.py) have its defaults and limits.
 
     modelClass is MDNN, or MDRFF[_<kernel>[_<bandwidth>]] with the kernels RBF, Matern12 (Laplace), Matern32, Matern52
     and as bandwidth a number (in standard deviations of the features), `median` (of the distances) or `validation`
@@ -41,6 +41,8 @@ class InferenceSettings(Section):
     fullCovariance: bool = _of_run("fullCovariance")
     hiddenLayers: tuple[int, ...] = _of_run("hiddenLayers")
     lr: float = _of_run("lr")
+    # Sources: batch and dropout, benchmarks/history.md (posteriors); defensive, below; the other numbers are rules of
+    # thumb, not counted.
     weight_decay: float = setting(1e-4, "of AdamW", low=0)
     # a quarter of the rows in four times the steps: more per second, measured on noise-free data
     batch: int = setting(64, "rows of a gradient step", low=1)
@@ -60,7 +62,7 @@ class InferenceSettings(Section):
     dropout: float = setting(0.1, "of the last member, below 1", low=0)
     fourierFeatures: int = setting(256, "frequencies of MDRFF: twice as many features", low=1)
     embedding: Any = setting(
-        None, "trained with the network, which then takes in rows of summary_learned (embedding.py)"
+        None, "trained with the network, which then takes in rows of summary_learned (summaries/learned.py)"
     )
 
     def __post_init__(self) -> None:

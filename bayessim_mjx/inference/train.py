@@ -15,15 +15,23 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 from bayessim_mjx.inference import densities, mdn
-from bayessim_mjx.inference.data import Data
-from bayessim_mjx.inference.linear_start import linear_start
+from bayessim_mjx.inference.densities import Params, density_of
 from bayessim_mjx.inference.settings import InferenceSettings
+from bayessim_mjx.inference.state import Data
+from bayessim_mjx.keys import GOLDEN
+from bayessim_mjx.linalg import REGRESSED, inverse_lower, product, ridge
 
-APART = np.uint32(2654435769)  # between the keys of points of the curve: the steps of each have the next ones
 CURVE = 40  # points of the loss curves, at least
-PACE = 0.5  # of steps in the trials of bases: at the full rate one was once judged by how it shook (damped pendulum)
-TRIED = 150  # gradient steps at least (and a fortieth) that bases are tried for, and before a training may end early
+# factor on steps in the trials of bases: at the full rate whitening was once chosen on the damped pendulum, 6.2 nats
+# for 7.3; at half none of six seeds did. source: benchmarks/history.md, posteriors
+PACE = 0.5
+# gradient steps at least (and a fortieth) that bases are tried for, and before a training may end early; source: rule
+# of thumb, not counted
+TRIED = 150
 MEMBERS = "members"  # axis of the ensemble
+# smallest precision beyond the prior's that a component of the probit chart starts with; source: rule of thumb, not
+# counted
+WEAK = 0.05
 
 
 def schedule_length(settings: InferenceSettings, capacity: int) -> tuple[int, int]:
@@ -42,7 +50,7 @@ def objective(
     drop: densities.Drop | None = None,
     x: Array | None = None,
 ) -> Array:
-    """What training maximises, per row: log q(theta | x), less the log of what the proposal makes of it."""
+    """The objective of training, per row: log q(theta | x), less the log of its integral under the proposal."""
     x = data.x[rows] if x is None else x
     return objective_of(mdn.forward(params, x, data.y.shape[-1], settings, drop), rows, data, settings)
 
@@ -59,7 +67,7 @@ def objective_of(heads: mdn.Heads, rows: Array, data: Data, settings: InferenceS
 
 @dataclass(frozen=True)
 class _Member:
-    """What stays the same in all steps of a member's training.
+    """Constant parts of all steps of a member's training.
 
     Its weights are one vector [W]: a few kernels per step instead of some for every layer.
     """
@@ -74,7 +82,7 @@ class _Member:
     def objective(
         self, flat: Array, basis: Array, rows: Array, seen: Array, drop: densities.Drop | None = None
     ) -> Array:
-        """Of rows [B] by the summaries x that are `seen` of them [B]."""
+        """The objective of rows [B], by the summaries `seen` [B] of them."""
         params = {**self.unravel(flat), **self.fixed}
         return objective(params, rows, self.data, self.settings, drop, self.data.x[basis, seen])
 
@@ -105,12 +113,12 @@ class _Member:
         count = jnp.maximum(jnp.sum(train.astype(jnp.int32)), 1)
         place = jnp.arange(chunk * batch, dtype=jnp.int32).reshape(chunk, batch)
         rows = order[place % count]
-        # the next keys: those of other points of the curve are APART, and what drops units hashes its key
+        # the next keys: those of other points of the curve are GOLDEN apart, and what drops units hashes its key
         keys = key[None, :] + jnp.arange(1, chunk + 1, dtype=key.dtype)[:, None]
         return rows, self.seen(rows, key[0] + (place // count).astype(key.dtype)), keys
 
     def seen(self, rows: Array, turn: Array) -> Array:
-        """Where summaries of `rows` stand in x: each turn another draw of their noise, where there are several."""
+        """Places of the summaries of `rows` in x: each turn another draw of their noise, where there are several."""
         if self.data.own is None:
             return rows
         own, n, more = self.data.own[rows], len(self.data.train), self.data.draws - 1
@@ -143,7 +151,7 @@ def train(
     values = jax.vmap(member.held_out)(starts, jnp.arange(tried, dtype=jnp.int32))
 
     def begin(basis: Array) -> tuple[tuple, tuple]:
-        """What is trained, and the best so far: held-out loss, weights, place on the curve."""
+        """Start of the training, and the best so far: held-out loss, weights, place on the curve."""
         flat, zero = starts[basis], jnp.asarray(0, jnp.int32)
         return (flat, member.optimiser.init(flat), zero), (values[basis], flat, zero - 1)
 
@@ -153,7 +161,7 @@ def train(
         basis = jnp.where(i == 0, jnp.argmin(jax.lax.all_gather(best[0], MEMBERS)[:tried]), basis)
         inner, best = jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), begin(basis), (inner, best))
         step = partial(member.step, basis, jnp.where(i < 0, PACE, 1.0))
-        inner, losses = jax.lax.scan(step, inner, member.batches(key + (i + trial).astype(key.dtype) * APART, chunk))
+        inner, losses = jax.lax.scan(step, inner, member.batches(key + (i + trial).astype(key.dtype) * GOLDEN, chunk))
         value = member.held_out(inner[0], basis)
         better = value < best[0]
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), (value, inner[0], i), best)
@@ -190,3 +198,54 @@ def _start(params: Any, data: Data, settings: InferenceSettings, fresh: Array) -
         new = prepare(new, x, data.y, data.train, held, settings)
     new = linear_start(new, x, data.y, data.train.astype(jnp.float32), settings)
     return jax.tree.map(lambda a, b: jnp.where(fresh, a, b), new, params)
+
+
+def linear_start(params: Params, x: Array, y: Array, weights: Array, settings: InferenceSettings) -> Params:
+    """Set the linear path to the ridge regression of y [n, d] on x [n, D] and every component to its residuals.
+
+    Training then starts at the best linear-Gaussian posterior instead of the prior; components keep their spread, in
+    units of the residual sd. Features that do not change in training are regressed on too. No change beyond REGRESSED
+    features, where the normal equations would cost more than they save.
+
+    Args:
+        params: of one member.
+        x: [n, D] as the network takes them in.
+        y: [n, d] in the network's coordinates.
+        weights: [n] 1 for rows to use and 0 for the rest.
+        settings: of the network.
+    """
+    (dim_x, d), k = (x.shape[1], y.shape[1]), settings.components
+    regressed = density_of(settings).regressed
+    design = jnp.concatenate([mdn.hidden(params, x, settings), x], axis=1) if regressed else x
+    if design.shape[1] > REGRESSED or d == 0:
+        return params
+    mean, slope = ridge(design, y, weights)
+    residual = (y - mean[None, :] - product(design, slope)) * weights[:, None]
+    cov = product(residual.T, residual) / jnp.maximum(jnp.sum(weights), 1.0) + 1e-4 * jnp.eye(d)
+    sd = jnp.sqrt(jnp.diagonal(cov))
+    if mdn.bounded(settings):
+        mean, slope, cov = _beyond_prior(mean, slope, cov)
+    factor = inverse_lower(jnp.linalg.cholesky(cov))  # A^T A = cov^-1
+    if not settings.fullCovariance:
+        factor = jnp.diag(1.0 / jnp.sqrt(jnp.diagonal(cov)))
+    last = params["layers"][-1]
+    spread = last["b"][k : k + k * d].reshape(k, d)
+    log_diagonal = 8 * jnp.arctanh(jnp.clip(jnp.log(jnp.diagonal(factor)) / 8, -0.99, 0.99))
+    parts = [jnp.zeros(k), (mean[None, :] + spread * sd[None, :]).reshape(-1), jnp.tile(log_diagonal, k)]
+    if settings.fullCovariance:
+        parts.append(jnp.tile(factor[np.tril_indices(d, -1)], k))
+    columns = jnp.tile(slope, (1, k))
+    weight = last["w"]
+    if regressed:
+        weight = weight.at[:, k : k + k * d].add(columns[:-dim_x])
+    skip = params["skip"].at[:, k : k + k * d].set(columns[-dim_x:])
+    layers = [*params["layers"][:-1], {"w": weight, "b": jnp.concatenate(parts)}]
+    return {**params, "layers": layers, "skip": skip}
+
+
+def _beyond_prior(mean: Array, slope: Array, cov: Array) -> tuple[Array, Array, Array]:
+    """Centre mu, its slope and (A^T A)^-1 of the component of precision I + A^T A with that posterior mean and cov."""
+    values, vectors = jnp.linalg.eigh(cov)
+    extra = jnp.maximum(1 / values - 1, WEAK)  # eigenvalues of A^T A
+    stretch = product(vectors * ((1 + extra) / extra)[None, :], vectors.T)  # m = (I + A^T A)^-1 A^T A mu
+    return stretch @ mean, product(slope, stretch), product(vectors / extra[None, :], vectors.T)

@@ -7,25 +7,25 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from bayessim_mjx.inference import ridge
 from bayessim_mjx.inference.densities import density_of
 from bayessim_mjx.inference.settings import InferenceSettings
-from bayessim_mjx.linalg import product
+from bayessim_mjx.linalg import product, ridge
 
-LIMIT = 512  # features up to which their eigenvectors are worth the cost; of more of them few tell something each
-MANY = 128  # features from which on a regression on the parameters is tried too
-MOST = 4096  # features up to which a regression on them is worth its cost
-FLOOR = 1e-3  # added to the noise's variances: rounding is not to be blown up
-EPS = 1e-6  # of a direction that neither parameters nor noise move
+LIMIT = 512  # features up to which they are whitened; source: 3262ad5, Ant's 600 features
+# features from which on a regression on the parameters is tried too; source: rule of thumb, not counted
+MANY = 128
+MOST = 4096  # features up to which a regression on them is made; source: cost alone
+FLOOR = 1e-3  # added to the noise's variances: rounding is not to be blown up; source: rule of thumb, not counted
+EPS = 1e-6  # of a direction that neither parameters nor noise move; source: float32
 
 
 def width(settings: InferenceSettings, dim_x: int, d: int) -> int:
-    """How many inputs a network of d parameters has: all D features, or two `regressed` ones for each parameter."""
+    """Number of inputs of a network of d parameters: all D features, or two `regressed` ones for each parameter."""
     return min(2 * d, dim_x) if LIMIT < dim_x <= MOST and _may_change(settings) and d else dim_x
 
 
 def count(settings: InferenceSettings, dim_x: int) -> int:
-    """How many bases are tried, each by another member of the ensemble (the last one is linear at first)."""
+    """Number of bases that are tried, each by another member of the ensemble (the last one is linear at first)."""
     if not _may_change(settings) or dim_x > LIMIT or settings.ensemble < 3:
         return 1
     return 2 + (dim_x > MANY)
@@ -70,13 +70,13 @@ def whitened(x: Array, train: Array, noise: Array | None = None) -> Array:
     unit = jax.lax.rsqrt(jnp.diagonal(noise) + FLOOR)  # features in units of their noise
     noise, cov = (unit[:, None] * c * unit[None, :] for c in (noise, product((x * weights[:, None]).T, x)))
     values, vectors = jnp.linalg.eigh(cov - noise)
-    told, chance = jnp.maximum(values, 0.0), jnp.sum(vectors * product(noise, vectors), axis=0)
-    share = (told + EPS) / (told + jnp.maximum(chance, 0.0) + EPS)
-    return unit[:, None] * vectors * (share * jax.lax.rsqrt(told + 1.0))[None, :]
+    signal, chance = jnp.maximum(values, 0.0), jnp.sum(vectors * product(noise, vectors), axis=0)
+    share = (signal + EPS) / (signal + jnp.maximum(chance, 0.0) + EPS)
+    return unit[:, None] * vectors * (share * jax.lax.rsqrt(signal + 1.0))[None, :]
 
 
 def regressed(x: Array, y: Array, train: Array) -> Array:
-    """What linear regression makes of each parameter and of its square [D, 2 d], with unit variance.
+    """Linear regressions of each parameter and of its square [D, 2 d], with unit variance.
 
     A network that sees hundreds of features, few of which tell something, learns by heart what the others do in the
     rows that it is trained on. The posterior's mean is a summary that loses little (Fearnhead and Prangle 2012,
@@ -85,7 +85,7 @@ def regressed(x: Array, y: Array, train: Array) -> Array:
     weights = train.astype(jnp.float32)
     n = jnp.maximum(jnp.sum(weights), 1.0)
     centred = y - (weights @ y / n)[None, :]
-    _, slope = ridge.ridge(x, jnp.concatenate([centred, centred**2], axis=1)[:, : x.shape[1]], weights)
+    _, slope = ridge(x, jnp.concatenate([centred, centred**2], axis=1)[:, : x.shape[1]], weights)
     shown = product(x, slope)
     variance = weights @ (shown - (weights @ shown / n)[None, :]) ** 2 / n
     return slope * jax.lax.rsqrt(variance + EPS)[None, :]

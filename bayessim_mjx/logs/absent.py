@@ -10,6 +10,7 @@ import numpy as np
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Channels
+from bayessim_mjx.logs.proposal import hint
 from bayessim_mjx.logs.table import Table
 
 
@@ -34,7 +35,7 @@ def filled(
     if len(absent) == len(channels.qpos) and len(slow) == len(channels.qvel):
         raise UserError(
             f"{table.path}: no column qpos:<joint> or qvel:<joint>, so there is no motion to compare; it has "
-            f"{', '.join(table.columns)}"
+            f"{', '.join(table.columns)}{hint(list(table.columns), mj_model)}"
         )
     home = dict(zip((f"qpos:{n}" for n in channels.qpos), mj_model.qpos0, strict=True))
     blank = {name: np.full(table.rows, home.get(name, 0.0)) for name in absent}

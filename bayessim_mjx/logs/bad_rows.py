@@ -27,7 +27,8 @@ def leave_out(
         sources: the table's column of each channel.
         policy: drop or nan.
     """
-    unreadable = {row: text for source in sources.values() for row, text in table.unreadable(source).items()}
+    used = {name: source for name, source in sources.items() if name in columns}
+    unreadable = {r: text for name, c in used.items() for r, text in table.unreadable(c, columns[name]).items()}
     bad = dict(table.ragged) | (unreadable if policy == "drop" else {})
     for name in needed_columns(columns, channels):
         for row in np.flatnonzero(~(np.abs(columns[name]) < LARGEST)).tolist():

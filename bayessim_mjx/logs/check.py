@@ -13,7 +13,10 @@ from scipy.ndimage import median_filter
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Channels, suggest
+from bayessim_mjx.logs.stamps import coarseness
 from bayessim_mjx.logs.table import Table
+from bayessim_mjx.logs.turns import placed
+from bayessim_mjx.logs.units import TIMES
 from bayessim_mjx.quantities import percent
 
 LARGEST = 1e15  # of a logged number: squares of larger ones are no longer numbers
@@ -53,7 +56,8 @@ def check_names(table: Table, columns: Mapping[str, Array], channels: Channels) 
     if missing:
         names = ", ".join(table.columns)
         constant = "a joint that was not recorded can be held constant in the map (qpos: {<joint>: {value: 0.0}})"
-        raise UserError(f"{table.path}: missing column(s) {', '.join(missing)}; it has {names}; {constant}")
+        way = "`bayessim-mjx logs check DIR --model FILE` proposes a map of columns with other names"
+        raise UserError(f"{table.path}: missing column(s) {', '.join(missing)}; it has {names}; {constant}; {way}")
 
 
 def check_finite(table: Table, columns: Mapping[str, Array], channels: Channels) -> None:
@@ -68,6 +72,19 @@ def check_finite(table: Table, columns: Mapping[str, Array], channels: Channels)
             at = f"{table.path}: column {column!r}, {table.where(int(bad[0]))}: {columns[column][bad[0]]}"
             mend = "`bad_rows: drop` in a map leaves such rows out"
             raise UserError(f"{at} ({len(bad)} such row(s)); allowed: finite numbers below {LARGEST:g}; {mend}")
+
+
+def _mend_of(time: Array) -> str:
+    """The key of the map for stamps that stand still or run back."""
+    grain = coarseness(time)
+    if grain:
+        rate = round((len(time) - 1) / max(float(time[-1] - time[0]), 1e-9), 3)
+        text = f"; the stamps are {grain:g} s apart and many rows share each, about {rate:g} rows per second"
+        return f"{text}: `time: {{column: ..., rate: ROWS_PER_SECOND}}` in a map spaces them evenly"
+    lost = float(np.mean(time < np.maximum.accumulate(time)))
+    if lost > 0.05:
+        return f"; a clock that begins anew ({percent(lost)} of the rows come after it): cut the file there into two"
+    return "; `bad_rows: drop` in a map leaves such rows out"
 
 
 def _kind(prefix: str) -> str:
@@ -87,14 +104,17 @@ def check_time(table: Table, time: Array, min_rows: int) -> None:
     if len(back):
         row = int(back[0]) + 1
         at = f"{table.path}: column 'time', {table.where(row)}: {time[row]:.9g} s after {time[row - 1]:.9g} s"
-        raise UserError(f"{at} ({len(back)} such row(s)); allowed: strictly increasing time")
+        raise UserError(f"{at} ({len(back)} such row(s)); allowed: strictly increasing time{_mend_of(time)}")
     period = float(np.median(steps))
     if period < SHORTEST:
         text = f"{table.path}: column 'time': median step {period:.4g} s"
         raise UserError(f"{text}; allowed: seconds, at least {SHORTEST:g} s per row")
     if period > 1.0:
         text = f"{table.path}: column 'time': median step {period:.4g} s"
-        mend = "milliseconds: `time: {column: time, scale: 0.001}` in the map"
+        names = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+        fits = [u for u in names if 1e-4 <= period * TIMES[u] <= 10.0] or ["ms"]
+        mends = (f"{names[u]}: `time: {{column: time, unit: {u}}}`, the same as scale: {TIMES[u]:g}" for u in fits)
+        mend = f"{' or '.join(mends)} in the map"
         raise UserError(f"{text}; allowed: seconds, up to 1 s per row ({mend})")
     local = median_filter(steps, 101, mode="nearest")  # a file may change its rate
     jitter = float(np.mean(np.abs(steps / local - 1.0) > 0.2))
@@ -111,21 +131,29 @@ def check_motion(
     channels: Channels,
     mj_model: mujoco.MjModel,
     through: NDArray[np.bool_],
+    absent: tuple[str, ...] = (),
+    declared: NDArray[np.bool_] | None = None,
 ) -> None:
     """Angles are continuous, quaternions have norm 1, commands fit the actuator. Unwraps hinges in place, warning.
 
+    Hinges that lie whole turns away from their targets or their range are moved (`turns.placed`).
+
     Args:
         through: [nu], the logged command is the actuator's own and no controller's.
+        absent: channels that were not measured.
+        declared: [nu], the logged command is the target of a position law that the log declares.
 
     Raises:
         UserError: jumps no joint makes, registers read with the wrong sign or unit.
     """
-    for i, (joint, kind) in enumerate(zip(channels.joints, channels.kinds, strict=True)):
+    for joint, kind in zip(channels.joints, channels.kinds, strict=True):
         if kind == "hinge":
             columns[f"qpos:{joint}"] = _unwrapped(table, joint, columns[f"qpos:{joint}"])
         if kind in ("ball", "free"):
             quat = [f"qpos:{c}" for c in channels.of_joint(joint)[-4:]]
             columns.update(zip(quat, _quaternion(table, joint, np.stack([columns[c] for c in quat], 1)).T, strict=True))
+    placed(table, columns, channels, mj_model, through, absent, declared)
+    for i, (joint, kind) in enumerate(zip(channels.joints, channels.kinds, strict=True)):
         if kind in ("hinge", "slide") and mj_model.jnt_limited[i]:
             _inside(table, f"qpos:{joint}", columns[f"qpos:{joint}"], mj_model.jnt_range[i], "range", 0.5)
     for i, actuator in enumerate(channels.actuators):
@@ -149,7 +177,8 @@ def _unwrapped(table: Table, joint: str, q: Array) -> Array:
         row = int(jumps[np.argmin(turns)])
         at = f"{table.path}: column 'qpos:{joint}', {table.where(row + 1)}"
         text = f"{at}: jump from {q[row]:.6g} to {q[row + 1]:.6g} rad in one step; allowed: below pi"
-        raise UserError(f"{text} (degrees or counts: `scale`, a wrapped encoder: `wrap` in the map)")
+        mend = "degrees: `unit: deg`, counts: `unit: counts` with `resolution`, a wrapped encoder: `wrap`"
+        raise UserError(f"{text} ({mend}, another unit: `scale` in the map)")
     where = table.where(int(jumps[0]) + 1)
     warnings.warn(
         f"{table.path}: column 'qpos:{joint}' wraps by 2 pi {len(jumps)} time(s), first at {where}; unwrapped",
@@ -179,7 +208,7 @@ def _inside(table: Table, column: str, x: Array, bounds: Array, what: str, toler
     at = f"{table.path}: column {column!r}, {table.where(worst)}"
     text = f"{at}: {x[worst]:.6g} is outside the model's {what} [{low:g}, {high:g}]"
     if abs(x[worst]) > 20.0 * max(abs(low), abs(high)):
-        raise UserError(f"{text} by far; allowed: the model's unit (mend it with `scale` in the map)")
+        raise UserError(f"{text} by far; allowed: the model's unit (mend it with `unit` or `scale` in the map)")
     warnings.warn(
         f"{text} ({len(outside)} row(s)); the simulation will clamp it" if what == "ctrlrange" else text, stacklevel=4
     )

@@ -9,11 +9,12 @@ from typing import Any
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.table import Table
+from bayessim_mjx.logs.texts import lines_of
 
 ALLOWED = 'allowed: one object per line, as {"time": 0.01, "ctrl": {"motor": 1.2}, "qpos": {"elbow": 0.3}}'
 
 
-def read_jsonl(path: Path, skip_rows: int = 0, lenient: bool = False) -> Table:
+def read_jsonl(path: Path, skip_rows: int = 0, lenient: bool = False, encoding: str | None = None) -> Table:
     """Read JSON lines: `{"qpos": {"elbow": 1}}` is the column `qpos:elbow`, `{"q": [1, 2]}` are `q[0]` and `q[1]`.
 
     A key that a line lacks, or null, is a blank field. Empty lines are passed over.
@@ -21,14 +22,12 @@ def read_jsonl(path: Path, skip_rows: int = 0, lenient: bool = False) -> Table:
     Args:
         skip_rows: lines before the first sample.
         lenient: a line that is no object becomes a row that holds nothing (`bad_rows`).
+        encoding: as the map states it, or None.
 
     Raises:
         UserError: a line that is no object, two keys that name the same column, no sample.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path}: not a text file ({error}); {ALLOWED}") from None
+    lines = lines_of(path, encoding, ALLOWED)
     rows: list[dict[str, str]] = []
     at: list[int] = []
     ragged: dict[int, str] = {}

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from bayessim_mjx.config import read_yaml
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.log import HOLDS, Array, suggest
+from bayessim_mjx.logs import stamps
+from bayessim_mjx.logs.log import Array, suggest
+from bayessim_mjx.logs.map_keys import plain, source_keys
 from bayessim_mjx.logs.table import Table
+from bayessim_mjx.logs.units import PERCENT, scale_of
+
+PLAIN = (
+    "files", "delimiter", "header", "skip_rows", "skip_after_header", "encoding", "decimal", "thousands", "bad_rows",
+    "hold", "rate",
+)  # fmt: skip
+
+S = TypeVar("S", bound="Source")
 
 
 @dataclass(frozen=True)
@@ -22,24 +32,49 @@ class Source:
     Attributes:
         column: header name, or index counted from 0; or
         value: a constant, for a channel that was not recorded but is known.
-        scale, offset, sign: value = sign * scale * raw + offset.
+        scale, offset, sign: value = sign * scale * (raw - zero) + offset; scale None: 1, and nobody said so.
+        unit: of the raw value, in place of scale; of counts with `resolution` (per turn), of percent with `range` (the
+            channel at 0 and at 100 %), of A and mA with `torque_constant` (N m/A).
+        zero: raw value where the channel is 0.
         signed: bits of a two's complement register that was stored unsigned (16: 65535 means -1).
         sign_magnitude: the bit that holds the sign, counted from 0; those below hold the magnitude (10: 1029 means -5).
             The registers of many hobby servos are of this kind.
+        suffix: text behind each number, such as ` rad`.
         wrap: period [raw units] at which the raw value jumps; it is unwrapped.
     """
 
     column: str | int | None = None
     value: float | None = None
-    scale: float = 1.0
+    scale: float | None = None
     offset: float = 0.0
     sign: int = 1
+    unit: str | None = None
+    zero: float = 0.0
+    resolution: float | None = None
+    range: Sequence[float] | None = None
+    torque_constant: float | None = None
     signed: int | None = None
     sign_magnitude: int | None = None
     wrap: float | None = None
+    suffix: str = ""
 
-    def read(self, table: Table, where: str, time: bool = False) -> Array:
-        """The channel [T] from the table; `time`: the column may hold dates.
+    @property
+    def stated(self) -> bool:
+        """Whether the map says in which unit the column is."""
+        return self.scale is not None or self.unit is not None or self.value is not None
+
+    def factors(self) -> tuple[float, float]:
+        """(scale, offset): value = scale * (raw - zero) + offset, with unit and sign."""
+        if self.unit == PERCENT:
+            low, high = self.range or (0.0, 1.0)
+            return self.sign * (high - low) / 100.0, self.offset + self.sign * low
+        scale = self.scale if self.scale is not None else 1.0
+        if self.unit is not None:
+            scale = scale_of(self.unit, self.resolution, self.torque_constant)
+        return self.sign * scale, self.offset
+
+    def read(self, table: Table, where: str) -> Array:
+        """The channel [T] from the table.
 
         Raises:
             UserError: no such column, a field that is no number or does not fit the register.
@@ -47,7 +82,16 @@ class Source:
         if self.value is not None:
             return np.full(table.rows, float(self.value))
         name = self.name(table, where)
-        raw = table.times(name) if time else table.numbers(name)
+        raw = self.decoded(table.numbers(name, self.suffix), table, name)
+        scale, offset = self.factors()
+        return scale * (raw - self.zero) + offset
+
+    def decoded(self, raw: Array, table: Table, name: str) -> Array:
+        """Raw values [T] of a register or a counter that wraps, as numbers.
+
+        Raises:
+            UserError: a field that does not fit the register.
+        """
         if self.signed is not None:
             half = 2.0 ** (self.signed - 1)
             raw = (raw + half) % (2 * half) - half
@@ -56,7 +100,7 @@ class Source:
         if self.wrap is not None:
             seen = np.isfinite(raw)
             raw[seen] = np.unwrap(raw[seen], period=self.wrap)
-        return self.sign * self.scale * raw + self.offset
+        return raw
 
     def _signed_magnitude(self, raw: Array, table: Table, name: str) -> Array:
         half = 2.0 ** (self.sign_magnitude or 0)
@@ -74,14 +118,61 @@ class Source:
         Raises:
             UserError: no such column.
         """
-        names = list(table.columns)
-        if isinstance(self.column, int) and str(self.column) not in names:
-            if 0 <= self.column < len(names):
-                return names[self.column]
-            raise UserError(f"{table.path}: no column {self.column} ({where}); allowed: 0 to {len(names) - 1}")
-        if str(self.column) not in names:
-            raise UserError(f"{table.path}: no column {self.column!r} ({where}); {suggest(str(self.column), names)}")
-        return str(self.column)
+        return column_of(table, self.column, where)
+
+
+def column_of(table: Table, column: str | int | None, where: str) -> str:
+    """The name in the table of a column that is given by its name or its index from 0.
+
+    Raises:
+        UserError: no such column.
+    """
+    names = list(table.columns)
+    if isinstance(column, int) and str(column) not in names:
+        if 0 <= column < len(names):
+            return names[column]
+        raise UserError(f"{table.path}: no column {column} ({where}); allowed: 0 to {len(names) - 1}")
+    if str(column) not in names:
+        raise UserError(f"{table.path}: no column {column!r} ({where}); {suggest(str(column), names)}")
+    return str(column)
+
+
+@dataclass(frozen=True)
+class Clock(Source):
+    """Where the times of the rows come from.
+
+    Attributes:
+        date: column with the dates, where `column` has the times of day.
+        nanoseconds: column that is added to one of whole seconds.
+        format: form of the dates, as in `strptime`, where two forms fit.
+        rate: rows per second: the stamps are too coarse or late, and rows follow each other evenly.
+    """
+
+    date: str | int | None = None
+    nanoseconds: str | int | None = None
+    format: str | None = None
+    rate: float | None = None
+
+    def read(self, table: Table, where: str) -> Array:
+        """Seconds [T]; see `stamps.seconds_of`."""
+        name = self.name(table, where)
+        date = None if self.date is None else column_of(table, self.date, where)
+        if table.dated(name) or date is not None or self.format is not None:
+            raw = table.times(name, date, self.format)
+            raw = raw if self.unit is None and self.scale is None else self.factors()[0] * raw
+        else:
+            raw = self._numbers(table, name, where)
+        return raw if self.rate is None else stamps.even(raw, self.rate, table, name)
+
+    def _numbers(self, table: Table, name: str, where: str) -> Array:
+        raw = self.decoded(table.numbers(name), table, name)
+        if self.nanoseconds is not None:
+            more = table.numbers(column_of(table, self.nanoseconds, where))
+            return self.factors()[0] * raw + 1e-9 * more + self.offset
+        if self.stated:
+            scale, offset = self.factors()
+            return scale * (raw - self.zero) + offset
+        return stamps.seconds_of(raw, table, name) + self.offset
 
 
 @dataclass(frozen=True)
@@ -90,6 +181,8 @@ class LogMap:
 
     Attributes:
         files: pattern of the files in a folder; delimiter, header, skip_rows: of CSV files (skip_rows: of all texts).
+        skip_after_header: lines between the header and the first row. encoding: of text files.
+        decimal, thousands: marks in the numbers of CSV files, see `numerals.Marks`.
         bad_rows: what becomes of rows that cannot be used: error, drop or nan (see `bad_rows.leave_out`).
         hold: how a command goes on from its row to the next: previous (None) or linear.
         time: s; rate: rows per second, in place of a column of times.
@@ -101,9 +194,13 @@ class LogMap:
     delimiter: str = ","
     header: bool = True
     skip_rows: int = 0
+    skip_after_header: int = 0
+    encoding: str | None = None
+    decimal: str | None = None
+    thousands: str | None = None
     bad_rows: str = "error"
     hold: str | None = None
-    time: Source = Source("time")
+    time: Clock = Clock("time")
     rate: float | None = None
     ctrl: Mapping[str, Source] = field(default_factory=dict)
     qpos: Mapping[str, Source] = field(default_factory=dict)
@@ -125,17 +222,18 @@ class LogMap:
         for key in content:
             if key not in allowed:
                 raise UserError(f"{path}: unknown key {key!r}; {suggest(str(key), allowed)}")
-        plain = ("files", "delimiter", "header", "skip_rows", "bad_rows", "hold", "rate")
-        settings: dict[str, Any] = {k: _plain(path, k, content[k]) for k in plain if k in content}
+        settings: dict[str, Any] = {k: plain(path, k, content[k]) for k in PLAIN if k in content}
+        if settings.get("decimal", ".") == settings.get("thousands"):
+            raise UserError(f"{path}: decimal and thousands are both {settings['thousands']!r}; allowed: two marks")
         if "time" in content and "rate" in content:
             raise UserError(
                 f"{path}: time and rate; allowed: one of them (rate: rows per second, without a time column)"
             )
         if "time" in content:
-            settings["time"] = _source(path, "time", content["time"])
+            settings["time"] = _source(path, "time", content["time"], Clock)
         for stream in ("ctrl", "qpos", "qvel", "streams"):
             block = _mapping(path, stream, content.get(stream, {}))
-            settings[stream] = {str(k): _source(path, f"{stream}.{k}", v) for k, v in block.items()}
+            settings[stream] = {str(k): _source(path, f"{stream}.{k}", v, Source) for k, v in block.items()}
         return cls(**settings, metadata=_mapping(path, "metadata", content.get("metadata", {})), path=path)
 
     @property
@@ -151,20 +249,20 @@ class LogMap:
         """
         if self.rate is not None:
             return np.arange(table.rows) / self.rate
-        return self.time.read(table, f"{self.path}: time", time=True)
+        return self.time.read(table, f"{self.path}: time")
 
     def apply(self, table: Table) -> dict[str, Array]:
         """Columns of the file as channels: time, ctrl:<actuator>, qpos:<joint>, qvel:<joint> and streams."""
-        channels = {name: source.read(table, where) for name, source, where in self._channels()}
+        channels = {name: source.read(table, where) for name, source, where in self.channels()}
         return {"time": self.clock(table), **channels}
 
     def sources(self, table: Table) -> dict[str, str]:
         """{channel: column of the file}, of those that have one."""
         timed = [] if self.rate is not None else [("time", self.time, f"{self.path}: time")]
-        every = (*timed, *self._channels())
+        every = (*timed, *self.channels())
         return {name: source.name(table, where) for name, source, where in every if source.value is None}
 
-    def _channels(self) -> Iterator[tuple[str, Source, str]]:
+    def channels(self) -> Iterator[tuple[str, Source, str]]:
         """(channel, where it comes from, the key for messages), but for the time."""
         for stream in ("ctrl", "qpos", "qvel", "streams"):
             for name, source in getattr(self, stream).items():
@@ -178,62 +276,9 @@ def _mapping(path: str, key: str, value: Any) -> Mapping[str, Any]:
     return value
 
 
-_KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
-    "files": (str, "a file pattern inside the folder such as '*.csv'"),
-    "delimiter": (str, "one character"),
-    "header": (bool, "true or false"),
-    "column": ((str, int), "a header name or an index from 0"),
-    "signed": (int, "a number of bits from 2 to 64, such as 16"),
-    "sign_magnitude": (int, "the bit of the sign, from 1 to 62, such as 10"),
-    "skip_rows": (int, "a number of lines from 0"),
-    "bad_rows": (str, "error, drop (leave such rows out) or nan (their other fields are missing)"),
-    "hold": (str, "previous (held until the next row) or linear"),
-    "rate": ((int, float), "rows per second, above 0"),
-    "sign": (int, "1 or -1"),
-}
-
-
-_WORDS = {"bad_rows": ("error", "drop", "nan"), "hold": HOLDS}
-
-
-def _plain(path: str, key: str, value: Any) -> Any:
-    """The value if it has the kind its key asks for (a number, where _KINDS says nothing else)."""
-    last = key.rsplit(".", 1)[-1]
-    kind, allowed = _KINDS.get(last, ((int, float), "a number"))
-    good = isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
-    if last == "delimiter":
-        good = good and len(value) == 1
-    if last == "sign":
-        good = good and value in (1, -1)
-    if last == "signed":
-        good = good and 2 <= value <= 64
-    if last == "sign_magnitude":
-        good = good and 1 <= value <= 62
-    if last in _WORDS:
-        good = good and value in _WORDS[last]
-    if last == "skip_rows":
-        good = good and value >= 0
-    if last == "rate":
-        good = good and 1e-300 < value < 1e300
-    if last == "files":
-        good = good and bool(value.strip()) and not Path(value).is_absolute() and ".." not in Path(value).parts
-    if last in ("value", "offset", "wrap", "scale"):
-        good = good and abs(value) < 1e300 and (last != "wrap" or value > 0) and (last != "scale" or value != 0)
-    if not good:
-        raise UserError(f"{path}: {key} = {value!r}; allowed: {allowed}")
-    return value
-
-
-def _source(path: str, key: str, value: Any) -> Source:
+def _source(path: str, key: str, value: Any, kind: type[S]) -> S:
     if isinstance(value, str | int) and not isinstance(value, bool):
-        return Source(column=value)
-    allowed = [f.name for f in fields(Source)]
+        return kind(column=value)
     block = _mapping(path, key, value)
-    for entry in block:
-        if entry not in allowed:
-            raise UserError(f"{path}: unknown key {key}.{entry}; {suggest(str(entry), allowed)}")
-    if ("column" in block) == ("value" in block):
-        raise UserError(f"{path}: {key} needs either column or value; it has {', '.join(block) or 'nothing'}")
-    if "signed" in block and "sign_magnitude" in block:
-        raise UserError(f"{path}: {key} has signed and sign_magnitude; allowed: one of them")
-    return Source(**{k: _plain(path, f"{key}.{k}", v) for k, v in block.items()})
+    source_keys(path, key, block, [f.name for f in fields(kind)])
+    return kind(**{k: plain(path, f"{key}.{k}", v) for k, v in block.items()})

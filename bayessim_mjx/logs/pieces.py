@@ -15,6 +15,8 @@ from bayessim_mjx.logs.table import Table
 
 MIN_ROWS = 10
 MAX_GAP = 5.0  # sample periods without a sample after which a file is cut in two
+# of a velocity that is so many times the derivative of its position
+_KEYS = {"`unit: deg/s`": 180.0 / np.pi, "`unit: rpm`": 30.0 / np.pi, "`unit: rev/s`": 0.5 / np.pi, "`sign: -1`": -1.0}
 SHORT_GAP = 0.01  # s; shorter pauses are bridged however fast the file is
 
 
@@ -134,4 +136,6 @@ def _compare(name: str, measured: Array, estimated: Array, spread: Array, channe
         slope = float(v @ w) / energy
         if not 0.7 < slope < 1.4:
             text = f"{name}: qvel:{channel} is about {slope:.3g} times the derivative of qpos:{channel}"
-            warnings.warn(f"{text}; allowed: the same unit and sign per second (mend it in the map)", stacklevel=2)
+            mend = next((key for key, value in _KEYS.items() if 0.97 < slope / value < 1.03), "`unit` or `scale`")
+            text = f"{text}; allowed: the same unit and sign per second (mend it by {mend} in the map)"
+            warnings.warn(text, stacklevel=2)

@@ -15,14 +15,19 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.absent import filled
 from bayessim_mjx.logs.bad_rows import leave_out
 from bayessim_mjx.logs.check import STREAMS, check_finite, check_motion, check_names, check_time
+from bayessim_mjx.logs.csv_files import Form, read_csv
+from bayessim_mjx.logs.doubts import check_units
+from bayessim_mjx.logs.duplicates import without_copies
 from bayessim_mjx.logs.files import FORMAT, Paths, distinct, files_of, map_of_folder, side_yaml
+from bayessim_mjx.logs.jitter import say_better_clock
 from bayessim_mjx.logs.jsonl import read_jsonl
 from bayessim_mjx.logs.log import HOLDS, Array, Channels, Log, suggest
 from bayessim_mjx.logs.mapping import LogMap
 from bayessim_mjx.logs.pieces import MIN_ROWS, pieces
-from bayessim_mjx.logs.table import Table, read_csv, read_npz
+from bayessim_mjx.logs.table import Table, read_npz
 from bayessim_mjx.physics import controllers
 
+FORM = ("delimiter", "header", "skip_rows", "skip_after_header", "encoding", "decimal", "thousands")
 LATEST = 1.0  # s by which commands may act later or earlier than their rows say
 
 
@@ -73,7 +78,7 @@ def _read_one(
     path: Path, mj_model: mujoco.MjModel, channels: Channels, log_map: LogMap | None, partial: bool
 ) -> list[Log]:
     log_map = log_map or LogMap()
-    table = _table(path, log_map)
+    table = table_of(path, log_map)
     if log_map.names_channels:
         columns, sources = log_map.apply(table), log_map.sources(table)
     else:
@@ -82,6 +87,7 @@ def _read_one(
     check_names(table, columns, channels)
     if table.lenient:
         table, columns = leave_out(table, columns, sources, channels, log_map.bad_rows)
+    table, columns = without_copies(table, columns)
     check_finite(table, columns, channels)
     check_time(table, columns["time"], MIN_ROWS)
     hold = {} if log_map.hold is None else {"hold": log_map.hold}
@@ -94,20 +100,29 @@ def _read_one(
     law = controllers.read(
         metadata, mj_model, channels.actuators, str(path)
     )  # refused here, before anything is simulated
-    check_motion(table, columns, channels, mj_model, np.asarray(law.through))
+    through, declared = np.asarray(law.through), np.asarray(law.on_position) > 0
+    check_units(table, columns, channels, mj_model, log_map, through, declared)
+    check_motion(table, columns, channels, mj_model, through, absent, declared)
+    say_better_clock(table, columns, channels, log_map)
     columns = _with_numbers(table, columns)
     if "condition" in metadata:
         metadata.setdefault("operating_condition", metadata["condition"])
     return pieces(table, columns, channels, metadata, absent)
 
 
-def _table(path: Path, log_map: LogMap) -> Table:
+def table_of(path: Path, log_map: LogMap) -> Table:
+    """The columns of a file as the map says it is written.
+
+    Raises:
+        UserError: a file that cannot be read so.
+    """
     lenient = log_map.bad_rows != "error"
     if path.suffix == ".npz":
         return replace(read_npz(path), lenient=lenient)
     if path.suffix == ".jsonl":
-        return read_jsonl(path, log_map.skip_rows, lenient)
-    return read_csv(path, log_map.delimiter, log_map.header, log_map.skip_rows, lenient)
+        return read_jsonl(path, log_map.skip_rows, lenient, log_map.encoding)
+    form = {key: getattr(log_map, key) for key in FORM}
+    return read_csv(path, Form(**form, lenient=lenient))
 
 
 def _with_numbers(table: Table, columns: dict[str, Array]) -> dict[str, Array]:

@@ -1,10 +1,10 @@
-"""Files to named columns: CSV with a header line, NPZ with arrays. Knows the file formats, not the model."""
+"""Named columns of one file, and NPZ files as such. Knows the file formats, not the model."""
 
 from __future__ import annotations
 
-import csv
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import instants
 from bayessim_mjx.logs.log import Array
+from bayessim_mjx.logs.numerals import Marks
 
 _WORDS = {"true": 1.0, "yes": 1.0, "on": 1.0, "false": 0.0, "no": 0.0, "off": 0.0, "": float("nan")}
+_COMMAS = Marks(",")
 _NUMBERS = "biufUS"  # NumPy's kinds of arrays that hold numbers, or texts of numbers
-_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Table:
     widths: Mapping[str, int] = field(default_factory=dict)  # NPZ: columns of each array
     lenient: bool = False  # what is no number is NaN (`bad_rows` in a map)
     ragged: Mapping[int, str] = field(default_factory=dict)  # lenient: rows that hold nothing, and what is wrong there
+    marks: Marks = Marks()  # in the numbers of a text file
     kept: Sequence[int] | None = None  # rows of the file, counted from its first, where some were left out
 
     @property
@@ -44,43 +46,64 @@ class Table:
     def where(self, row: int) -> str:
         return f"row {self.row(row)}" if self.first_line is None else f"line {self.row(row) + self.first_line}"
 
-    def times(self, column: str) -> Array:
-        """The column [T] in its own unit, or in seconds since the first row where it holds dates (ISO 8601).
-
-        Raises:
-            UserError: a field that is neither, naming its line.
-        """
+    def dated(self, column: str) -> bool:
+        """Whether the column holds dates or times of day."""
         values = self.columns[column]
         texts = values.dtype.kind in "US" if isinstance(values, np.ndarray) else True
-        if not texts or not instants.dated(map(str, values)):
-            return self.numbers(column)
-        at = f"{self.path}: column {column!r}, "
-        return instants.seconds([str(v) for v in values], lambda row: at + self.where(row), self.lenient)
+        return texts and instants.dated(map(str, values))
 
-    def unreadable(self, column: str) -> dict[int, str]:
-        """Rows of a column whose field is neither blank nor a number, and what is there; only where `lenient`."""
+    def times(self, column: str, date: str | None = None, form: str | None = None) -> Array:
+        """Seconds [T] since the first row of a column of dates or times of day.
+
+        Args:
+            date: column with the dates, where `column` has times of day. form: as of `instants.seconds`.
+
+        Raises:
+            UserError: a field that is no time, naming its line.
+        """
+        fields = [str(v).strip() for v in self.columns[column]]
+        if date is not None:
+            fields = [f"{str(d).strip()} {t}".strip() for d, t in zip(self.columns[date], fields, strict=True)]
+        at = f"{self.path}: column {column!r}, "
+        return instants.seconds(fields, lambda row: at + self.where(row), self.lenient, form)
+
+    def unreadable(self, column: str, found: Array) -> dict[int, str]:
+        """Rows of a column whose field is neither blank nor a number, and what is there; only where `lenient`.
+
+        Args:
+            found: [T], what was read of it, NaN where nothing was.
+        """
         values = self.columns[column]
         if isinstance(values, np.ndarray) and values.dtype.kind not in "US":
             return {}
-        nothing = ~np.isfinite(self.times(column))
-        rows = (row for row in np.flatnonzero(nothing).tolist() if str(values[row]).strip().lower() not in ("", "nan"))
+        rows = (r for r in np.flatnonzero(~np.isfinite(found)).tolist() if _filled(str(values[r])))
         return {row: f"column {column!r} holds {values[row]!r}" for row in rows}
 
-    def numbers(self, column: str) -> Array:
+    def numbers(self, column: str, suffix: str = "") -> Array:
         """The column as float64 [T]; blank fields are NaN. A column of words alone: true, yes, on are 1, the others 0.
+
+        Args:
+            suffix: text behind each number, such as its unit.
 
         Raises:
             UserError: a field that is no number, naming its line.
         """
         values = self.columns[column]
+        if suffix and not isinstance(values, np.ndarray):
+            bare = [v.strip().removesuffix(suffix.strip()).strip() for v in values]
+            return replace(self, columns={column: bare}).numbers(column)
         if isinstance(values, np.ndarray) and values.dtype.kind not in _NUMBERS:
             raise UserError(f"{self.path}: column {column!r} holds {values.dtype}; allowed: real numbers")
+        if self.marks == _COMMAS and not isinstance(values, np.ndarray) and not any("." in v for v in values):
+            values = [v.replace(",", ".") for v in values]  # as a whole, which is faster than field by field
         try:
-            if not isinstance(values, np.ndarray) and not all(map(str.isascii, values)):
-                raise ValueError("digits of other scripts")
+            if not (self.marks.plain or self.marks == _COMMAS) or (
+                not isinstance(values, np.ndarray) and not all(v.isascii() and "_" not in v for v in values)
+            ):
+                raise ValueError("to be read field by field")
             return np.asarray(values).astype(np.float64)
         except (TypeError, ValueError):
-            words = [str(v).strip().lower() for v in values]
+            words = [str(v).strip().lower() for v in self.columns[column]]
             switch = self._switch(words)
             return np.array([self._number(column, row, word, switch) for row, word in enumerate(words)])
 
@@ -91,16 +114,34 @@ class Table:
 
     def _number(self, column: str, row: int, text: str, switch: bool) -> float:
         try:
-            if not text.isascii():
-                raise ValueError("digits of other scripts")
-            return _WORDS[text] if switch or not text else float(text)
+            if "_" in text:
+                raise ValueError("a mark that only programs allow")
+            return _WORDS[text] if switch or not text else self.marks.number(text)
         except (ValueError, KeyError):
-            if self.lenient:
+            if self.lenient and not (self.marks.doubt and "," in text):
                 return float("nan")
             at = f"{self.path}: {self.where(row)}, column {column!r}"
-            raise UserError(
-                f"{at}: {text!r} is not a number; allowed: numbers, or a column of true, false, yes, no, on, off"
-            ) from None
+            allowed = "allowed: numbers, or a column of true, false, yes, no, on, off"
+            raise UserError(f"{at}: {self._wrong(text)}; {allowed}") from None
+
+    def _wrong(self, text: str) -> str:
+        """Why a field is no number, and the key of the map that mends it."""
+        if self.marks.doubt and "," in text:
+            return f"{text!r} {self.marks.doubt}"
+        if self.marks.stated and re.search(r"\d[.,]\d", text):
+            marks = f"`decimal: {self.marks.decimal!r}`, `thousands: {self.marks.thousands!r}`"
+            return f"{text!r} is not a number by {marks} of the map; `thousands` is the mark between groups of three"
+        if re.fullmatch(r"[+-]?[\d.,'\s]+", text):
+            return f"{text!r} is not a number; `decimal` and `thousands` in a map state the marks in it (docs/logs.md)"
+        if match := re.fullmatch(r"[+-]?\d[\d.,]*(?:e[+-]?\d+)?(\s*[^\d\s.,_].*)", text):
+            return (
+                f"{text!r} has a unit behind its number; `suffix: {match[1]!r}` of the channel in a map passes over it"
+            )
+        return f"{text!r} is not a number; `bad_rows: drop` or `bad_rows: nan` in a map leaves such fields out"
+
+
+def _filled(text: str) -> bool:
+    return text.strip().lower() not in ("", "nan")
 
 
 def _is_number(text: str) -> bool:
@@ -108,53 +149,6 @@ def _is_number(text: str) -> bool:
         return np.isfinite(float(text))
     except ValueError:
         return False
-
-
-def read_csv(path: Path, delimiter: str = ",", header: bool = True, skip_rows: int = 0, lenient: bool = False) -> Table:
-    """Read a CSV file; columns of a file without a header line are called 0, 1, 2 ...
-
-    A column without a name is called `unnamed <its number>`, or left out where it is blank throughout, as after a comma
-    at the end of each line.
-
-    Args:
-        skip_rows: lines before the header, or before the first row where there is none.
-        lenient: a row of the wrong length becomes one that holds nothing (`bad_rows`).
-
-    Raises:
-        UserError: no rows, a repeated column, a row of the wrong length, another delimiter.
-    """
-    try:
-        text = path.read_text(encoding="utf-8-sig").splitlines()[skip_rows:]
-        lines = list(csv.reader(text, delimiter=delimiter))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{path}: not a text file ({error}); allowed: CSV with a header line, or NPZ") from None
-    while lines and not any(f.strip() for f in lines[-1]):
-        lines.pop()
-    body = lines[1:] if header else lines
-    if not body:
-        raise UserError(f"{path}: no data rows; allowed: a header line and one row per sample")
-    names = [f.strip().lstrip("#").strip() for f in lines[0]] if header else [str(i) for i in range(len(body[0]))]
-    other = next((d for d in _DELIMITERS if d in names[0]), None) if len(names) == 1 else None
-    if other is not None:
-        mend = f"`delimiter: {other!r}` in a map (docs/logs.md)"
-        raise UserError(
-            f"{path}: one column {names[0]!r}: its fields are parted by {_DELIMITERS[other]}; mend it with {mend}"
-        )
-    unnamed = [i for i, name in enumerate(names) if not name]
-    names = [name or f"unnamed {i}" for i, name in enumerate(names)]
-    repeated = sorted({n for n in names if names.count(n) > 1})
-    if repeated:
-        raise UserError(f"{path}: column {repeated[0]!r} appears more than once in the header")
-    first = skip_rows + (2 if header else 1)
-    ragged = {row: f"{len(fields)} fields" for row, fields in enumerate(body) if len(fields) != len(names)}
-    if ragged and not lenient:
-        row = min(ragged)
-        raise UserError(f"{path}: line {row + first} has {ragged[row]}; allowed: {len(names)} ({', '.join(names)})")
-    body = [[""] * len(names) if row in ragged else fields for row, fields in enumerate(body)]
-    columns = {name: [r[i] for r in body] for i, name in enumerate(names)}
-    blank = {names[i] for i in unnamed if not any(r[i].strip() for r in body)}
-    columns = {name: column for name, column in columns.items() if name not in blank}
-    return Table(path, columns, first, lenient=lenient, ragged=ragged)
 
 
 def read_npz(path: Path) -> Table:

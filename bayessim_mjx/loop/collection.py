@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from bayessim_mjx.inference import feature_names, summaries
+from bayessim_mjx.inference import summaries
+from bayessim_mjx.inference.summarizers import feature_names
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory
 
-RANDOM_SHARE = 0.1  # policy_rl_randomized: share of the steps with a uniformly random action (BayesSimIG)
+RANDOM_SHARE = 0.1  # policy_rl_randomized: share of the steps with a uniformly random action; source: BayesSimIG
 POLICY_DEPENDENT = ("policy_rl", "policy_rl_randomized")
 
 
@@ -65,7 +66,7 @@ def summarise(summarizer: Callable, trajectory: Trajectory) -> Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class Seen:
+class SummaryInputs:
     """Named inputs of a summarizer."""
 
     steps: int
@@ -75,10 +76,10 @@ class Seen:
 
     def features(self, summary: str) -> tuple[str, ...]:
         """A name for every feature."""
-        return (*feature_names.names(summary, self.steps, self.states, self.actions), *self.context)
+        return (*feature_names(summary, self.steps, self.states, self.actions), *self.context)
 
     def embedding(self, summary: str) -> Any:
-        """The network that learns features from the summary's (inference/embedding.py); None: they are features."""
+        """The network that learns features from the summary (summaries/learned.py); None: the summary has them."""
         learn = summaries.entry(summary)[0].embedding
         return None if learn is None else learn(self.steps, len(self.states), len(self.actions))
 

@@ -1,34 +1,56 @@
 """Examination of a round's posteriors by further simulations.
 
-Simulated sets of as many trajectories tell whether a product of posteriors is as sure as it may be. The command
-`calibrate` repeats all checks of a finished round.
+Simulated sets of as many trajectories show whether a product of posteriors is too narrow or off. The product is moved
+and widened by that. It replaces the last round's posterior only if it gains as much on simulated trajectories. No rule
+uses the real trajectories, so the chosen posterior covers as often as before. The command `calibrate` repeats all
+checks of a finished round.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from dataclasses import replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import checks, near, rounds, sets
-from bayessim_mjx.inference.sets import Sets
+from bayessim_mjx.inference import checks, local_recalibration, product_calibration, rounds
+from bayessim_mjx.inference.calibration import Report
+from bayessim_mjx.inference.product_calibration import Sets
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import ranges
-from bayessim_mjx.loop.factors import conditioned, kept, multiplied
-from bayessim_mjx.loop.simulations import at, features, proposal_of, simulated
+from bayessim_mjx.loop.posterior import conditioned, kept, multiplied
 from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round, slot_of
+from bayessim_mjx.loop.trajectories import at, features, proposal_of, simulated
+from bayessim_mjx.quantities import fixed
 from bayessim_mjx.rl import Policy
 
-SETS = 64  # thetas at which sets are simulated
-# trajectories in one, at most: beyond that the error that all of them share is taken to stay (`Sets.widening`)
+# simulated sets of trajectories that judge a posterior; 64 are too few for a widening of less than one step of
+# product_calibration.FACTORS. source: docs/inference.md, several trajectories; the number itself is a rule of thumb
+SETS = 64
+# trajectories in one set, at most: beyond that the error that all of them share is taken to stay (`Sets.widening`).
+# source: rule of thumb, not counted
 MOST = 32
-PAIRS, LOTS = 500, 4  # `reexamine` judges sets in as many lots as there are such parts of the pairs, up to this
-REFERENCE = 10000  # simulations that `reexamine` compares real trajectories with, at most
+PAIRS, LOTS = 500, 4  # `reexamine` judges one lot of sets for each 500 pairs, at most 4 lots; source: cost alone
+REFERENCE = 10000  # simulations that `reexamine` compares real trajectories with, at most; source: cost alone
+
+
+def calibrate_product(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
+    """Move and widen the product as simulated sets of as many trajectories require."""
+    if round_.loop.settings.temperature:
+        return answer, Evidence()
+    clock, known, now = time.perf_counter(), round_.known, (round_.loop, round_.state, round_.policy)
+    found = recalibrated(*now, known, answer.posterior, judge(*now, known))
+    if found is None:
+        return answer, Evidence()
+    seconds = {"check": time.perf_counter() - clock}
+    used = replace(answer, posterior=found.used(answer.posterior, known), sets=found)
+    return used, Evidence({"sets": found}, scores(found, known), seconds=seconds)
 
 
 def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | None:
@@ -41,23 +63,10 @@ def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | No
         return None
     key = branch(loop.key(int(state.round), "fit"), 4)
     found = _simulated(loop, state, policy, known, key)
-    return None if found is None else replace(sets.judge(*found, loop.settings.components), known=known)
+    return None if found is None else replace(product_calibration.judge(*found, loop.settings.components), known=known)
 
 
-def widen(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
-    """Move and widen the product as simulated sets of as many trajectories require."""
-    if round_.loop.settings.temperature:
-        return answer, Evidence()
-    clock, known, now = time.perf_counter(), round_.known, (round_.loop, round_.state, round_.policy)
-    found = settled(*now, known, answer.posterior, judge(*now, known))
-    if found is None:
-        return answer, Evidence()
-    seconds = {"check": time.perf_counter() - clock}
-    used = replace(answer, posterior=found.used(answer.posterior, known), sets=found)
-    return used, Evidence({"sets": found}, scores(found, known), seconds=seconds)
-
-
-def settled(
+def recalibrated(
     loop: Loop, state: LoopState, policy: Policy, known: int, product: Distribution, found: Sets | None
 ) -> Sets | None:
     """`judge`'s answer, with what sets at draws of the posterior of the `known` real trajectories ask for."""
@@ -68,30 +77,7 @@ def settled(
     def drawn(posterior: Distribution, turn: int) -> tuple[list[list[Distribution]], np.ndarray] | None:
         return _simulated(loop, state, policy, known, branch(key, turn), posterior)
 
-    return near.settled(found, product, drawn, loop.settings.components)
-
-
-def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array, more: int = 1) -> Sets | None:
-    """Products as the round used them, as it widened and moved them, judged on `more` times as many sets, unseen by it.
-
-    `state` is that of the round, with its network, temperature, proposal and real trajectories' posteriors.
-    """
-    product, used, k = multiplied(loop, state, known)[0], None, loop.settings.components
-    if not loop.settings.temperature:
-        used = settled(loop, state, policy, known, product, judge(loop, state, policy, known))
-
-    def again(first: int, around: Distribution | None) -> tuple[list[list[Distribution]], np.ndarray] | None:
-        lots = [_simulated(loop, state, policy, known, branch(key, first + i), around) for i in range(more)]
-        good = [lot for lot in lots if lot is not None]
-        return ([row for lot in good for row in lot[0]], np.concatenate([lot[1] for lot in good])) if good else None
-
-    if (found := again(0, None)) is None:
-        return None
-    judged = sets.judge(*found, k, widened_by=(lambda n: 1.0) if used is None else used.widening)
-    if used is None or not used.near or (found := again(more, used.used(product, known))) is None:
-        return judged
-    row = near.count(*found, k, used.move, used.widening(used.counts[-1].trajectories))
-    return replace(judged, near=(row,), move=used.move)
+    return local_recalibration.recalibrated(found, product, drawn, loop.settings.components)
 
 
 def _simulated(
@@ -125,10 +111,52 @@ def _simulated(
 def scores(found: Sets, known: int) -> dict[str, float]:
     """Numbers for curves, of the posterior of `known` trajectories."""
     one = found.at(known)
-    told = {"widening": found.widening(known), "gain": one.gain, "carried": float(found.carried)}
-    told |= {"moved": float(found.move is not None)}
-    told |= {f"coverage_{100 * level:.0f}": one.coverage(level) for level in sets.LEVELS}
-    return {f"sets/{name}": float(value) for name, value in told.items()}
+    numbers = {"widening": found.widening(known), "gain": one.gain, "carried": float(found.saturates_at)}
+    numbers |= {"moved": float(found.move is not None)}
+    numbers |= {f"coverage_{100 * level:.0f}": one.coverage(level) for level in product_calibration.LEVELS}
+    return {f"sets/{name}": float(value) for name, value in numbers.items()}
+
+
+def keep_or_replace(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
+    """Keep the last round's posterior where it gained more on simulated trajectories."""
+    b, state, verdict = round_.loop.settings, round_.state, round_.learnt.verdict
+    if verdict is None or b.temperature or round_.loop.sequential:  # no gain is judged, or rounds cannot be compared
+        return answer, Evidence()
+    gain = expected(verdict[0], answer.sets, round_.known)
+    last, before = state.standing, -np.inf if state.standing_gain is None else float(state.standing_gain)
+    if last is not None and gain < before and not _moved(last, answer.posterior):
+        gained = f"{fixed(gain, 1)} nats" if np.isfinite(gain) else "nothing"
+        warning = (
+            f"this round's posterior gains {gained} on simulated trajectories, that of the last round "
+            f"{fixed(before, 1)} nats: the last one stands"
+        )
+        stands = dataclasses.replace(answer, posterior=last, source="last round")
+        return stands, Evidence(scores={"sets/stood": 1.0}, warnings=[warning])
+    if not np.isfinite(gain):
+        return answer, Evidence()
+    own = jnp.asarray(state.round, jnp.int32) + 1
+    kept = {"standing": answer.posterior, "standing_gain": jnp.float32(gain), "standing_round": own}
+    return answer, Evidence(kept=kept)
+
+
+def expected(report: Report | None, found: Sets | None, known: int) -> float:
+    """Nats over the prior that a posterior of `known` trajectories gains on simulated ones; -inf: none is a density."""
+    gain = report.gain if report is not None and known == 1 else found.at(known).gain if found is not None else -np.inf
+    return float(gain) if np.isfinite(gain) else -np.inf
+
+
+def _moved(last: Distribution, posterior: Distribution) -> bool:
+    """Whether their ranges differ, so that their gains cannot be compared."""
+    ends = ((np.asarray(d.space.low), np.asarray(d.space.high)) for d in (last, posterior))
+    return not all(np.array_equal(a, b) for a, b in zip(*ends, strict=True))
+
+
+def reused_posterior(state: LoopState) -> str:
+    """A sentence on a finished round that uses the posterior of an earlier one; "" where it uses its own."""
+    stands, done = int(state.standing_round or 0), int(state.round)
+    if stands in (0, done):
+        return ""
+    return f"the posterior in use is that of round {stands}: simulated trajectories promise less of round {done}'s"
 
 
 def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: int = 0) -> checks.Checks:
@@ -162,4 +190,30 @@ def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: in
     return replace(checks.conclude(report, verdict[1], domain, b.distrust), sets=sets)
 
 
-__all__ = ["judge", "reexamine", "rejudge", "scores", "settled", "widen"]
+def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array, more: int = 1) -> Sets | None:
+    """Products as the round used them, as it widened and moved them, judged on `more` times as many sets, unseen by it.
+
+    `state` is that of the round, with its network, temperature, proposal and real trajectories' posteriors.
+    """
+    product, used, k = multiplied(loop, state, known)[0], None, loop.settings.components
+    if not loop.settings.temperature:
+        used = recalibrated(loop, state, policy, known, product, judge(loop, state, policy, known))
+
+    def again(first: int, around: Distribution | None) -> tuple[list[list[Distribution]], np.ndarray] | None:
+        lots = [_simulated(loop, state, policy, known, branch(key, first + i), around) for i in range(more)]
+        good = [lot for lot in lots if lot is not None]
+        return ([row for lot in good for row in lot[0]], np.concatenate([lot[1] for lot in good])) if good else None
+
+    if (found := again(0, None)) is None:
+        return None
+    judged = product_calibration.judge(*found, k, widened_by=(lambda n: 1.0) if used is None else used.widening)
+    if used is None or not used.near or (found := again(more, used.used(product, known))) is None:
+        return judged
+    row = local_recalibration.count(*found, k, used.move, used.widening(used.counts[-1].trajectories))
+    return replace(judged, near=(row,), move=used.move)
+
+
+__all__ = [
+    "calibrate_product", "expected", "judge", "keep_or_replace", "reexamine", "rejudge", "reused_posterior", "scores",
+    "recalibrated",
+]  # fmt: skip

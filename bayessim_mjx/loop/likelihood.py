@@ -6,23 +6,39 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from scipy.special import gammainc, gammaln
 
 from bayessim_mjx.distributions.charts import from_chart, to_chart
 from bayessim_mjx.kalman import Gains
-from bayessim_mjx.loop.noise import FINEST, Linear, Noise, NoiseModel
-from bayessim_mjx.loop.starts import Starts
-from bayessim_mjx.loop.travel import repeated, silent, travel
+from bayessim_mjx.logs.signals import LEVELS, values_shown
+from bayessim_mjx.loop.noise import FINEST, Linear, Noise, NoiseModel, Starts
 from bayessim_mjx.physics import Physics
+from bayessim_mjx.physics.tangent import addresses, difference
 from bayessim_mjx.tracking import Record, close, errors, transitions
 
-SETTLED = 0.1  # relative change of the log likelihood's unit at which noise and posterior agree
-LOOKED = 16  # trajectories at which noise is estimated
-TURNS = 6  # of noise and linear dynamics, at most, before anything is replayed
-NEAR = 0.3  # standard deviations of the posterior: a shorter step to its mean ends these turns
-SLOPE = 0.01  # step of central differences in z
-LEAP = 1.0  # longest step in z that linear dynamics are believed
+# relative change of the log likelihood's unit at which noise and posterior agree; source: rule of thumb, not counted
+SETTLED = 0.1
+# trajectories that the noise is estimated from: 4 were too few (4454ff8). source: rule of thumb, not counted
+LOOKED = 16
+TURNS = 6  # of noise and linear dynamics, at most, before anything is replayed; source: rule of thumb, not counted
+# standard deviations of the posterior: a shorter step to its mean ends these turns; source: rule of thumb, not counted
+NEAR = 0.3
+# step of central differences in z, prior standard deviations: damping was off by 1.1 of its standard deviations with
+# .05, by .02 with .01. source: counted on Cartpole's pole, 32 trajectories
+SLOPE = 0.01
+# longest step in z in which linear dynamics are used, prior standard deviations; source: rule of thumb, not counted
+LEAP = 1.0
+# rad, m, rad/s, m/s: motion of a resting joint by rounding in float32 and in the simulator; source: rule of thumb, not
+# counted
+STILL = 1e-6
+# Rows of one value that tell as much as if their errors were independent: with it root mean squares of z are .92 to .99
+# where encoders show 2 to 52 rows a count, up to 3.5 without. source: benchmarks/inference/counts.py
+ROWS = 4
+# standard deviations of the sensor: resampling changes a value between two equal rows by less; source: rule of thumb,
+# not counted
+SAME = 0.1
 
 
 class Likelihood:
@@ -52,13 +68,13 @@ class Likelihood:
         self.silent = silent(record, physics.mj_model, sensor)
         self.scale = size = travel(record, physics.mj_model)
         known = np.isfinite(sensor) & ~self.silent
-        told = np.where(known, sensor, 0.0)
-        self.told = np.where(known, np.maximum(told, FINEST * size), np.inf)  # of one row, as of a start
-        more = repeated(record, physics.mj_model, told, self.valid)
-        self.floor = np.where(known, np.maximum(told * more, FINEST * size), np.inf)
+        stated = np.where(known, sensor, 0.0)
+        self.stated = np.where(known, np.maximum(stated, FINEST * size), np.inf)  # of one row, as of a start
+        more = repeated(record, physics.mj_model, stated, self.valid)
+        self.floor = np.where(known, np.maximum(stated * more, FINEST * size), np.inf)
         self.seen = np.isfinite(self.floor)
         self.starts = Starts(record, physics.mj_model)
-        self.begun = record  # from the most likely starts
+        self.shrunk = record  # from the most likely starts
         self.model = NoiseModel(self.floor, size, physics.dt, self.starts)
         self.nv = nv
         self.noise = Noise(self.floor, np.zeros(nv))
@@ -123,7 +139,9 @@ class Likelihood:
         ways, gaps = self._dynamics(theta, path, self.parts)
         linear = self._linear(theta, path, ways, gaps)
         self.noise = self.model.likely(linear, self.noise)
-        self.begun = self.starts.begun(self.told)  # by the told noise: what else sensors show is no error of starts
+        self.shrunk = self.starts.shrunk(
+            self.stated
+        )  # by the stated noise: what else sensors show is no error of starts
         self.laplace = self._posterior(linear)
         gains = self.model.gains(ways, self.noise)
         mask = jnp.asarray(self.valid, jnp.float32)[:, :, None, None]
@@ -144,7 +162,7 @@ class Likelihood:
 
     def _dynamics(self, theta: np.ndarray, path: Gains, parts: list[slice]) -> tuple[np.ndarray, np.ndarray]:
         found = [
-            transitions(self.physics, theta, _rows(self.begun, part), _rows(path, part), self.scale) for part in parts
+            transitions(self.physics, theta, _rows(self.shrunk, part), _rows(path, part), self.scale) for part in parts
         ]
         return np.concatenate([ways for ways, _ in found]), np.concatenate([gaps for _, gaps in found])
 
@@ -163,7 +181,7 @@ class Likelihood:
     def squares(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared whitened prediction errors [M, N, blocks] at thetas [M, d]."""
         assert self.gains is not None, "settle first"
-        each = [errors(self.physics, thetas, _rows(self.begun, part), _rows(self.gains, part)) for part in self.parts]
+        each = [errors(self.physics, thetas, _rows(self.shrunk, part), _rows(self.gains, part)) for part in self.parts]
         return np.concatenate([np.asarray(x, np.float64) for x in each], axis=1)
 
     @property
@@ -174,7 +192,7 @@ class Likelihood:
 
     @property
     def least(self) -> float:
-        """The least factor on the variance of the noise as it was estimated: no sensor is better than was told.
+        """The least factor on the variance of the noise as it was estimated: no sensor is better than its stated noise.
 
         Velocity's noise may be any ratio of position's (RATIOS), so positions tell, where they are measured.
         """
@@ -203,4 +221,42 @@ def _rows(tree: Any, rows: slice) -> Any:
     return jax.tree.map(lambda x: x[rows], tree)
 
 
-__all__ = ["Likelihood"]
+def travel(record: Record, model: mujoco.MjModel) -> np.ndarray:
+    """Range of motion [2 nv] of positions (angles at most pi) and velocities; of what rests, a share of the largest."""
+    qpos, qvel = (np.asarray(x, float).reshape(-1, x.shape[-1]) for x in (record.qpos, record.qvel))
+    places = addresses(model)
+    moved = np.array([min(np.ptp(qpos[:, q]), np.pi) if q is not None else 1.0 for q in places])
+    return np.concatenate([np.maximum(x, max(FINEST * x.max(), STILL)) for x in (moved, np.ptp(qvel, axis=0))])
+
+
+def silent(record: Record, model: mujoco.MjModel, sensor: np.ndarray) -> np.ndarray:
+    """[2 nv]: measured channels without a stated noise (0) that show fewer than LEVELS values, too few to estimate it.
+
+    A held joint has no residual, hence no estimate of its noise. Whatever was assumed would be the simulator's own
+    rounding, and each of its residuals millions of standard deviations.
+    """
+    shown = [values_shown(column) for column in _channels(record, model).reshape(-1, 2 * model.nv).T]
+    return np.isfinite(sensor) & ~(np.asarray(sensor) > 0) & (np.array(shown) < LEVELS)
+
+
+def repeated(record: Record, model: mujoco.MjModel, sensor: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """[2 nv] factors on the sensors' standard deviations: of rows that repeat a value, ROWS tell and others do not.
+
+    An encoder's error stays while its count does. Taken for white noise, a hundred rows of one count would be averaged
+    to a tenth of it, and a posterior would be surer the more often a slow motion is sampled.
+    """
+    steps = np.abs(np.diff(_channels(record, model), axis=1))
+    same = steps <= SAME * np.where(np.isfinite(sensor), sensor, 0.0)
+    last = same.shape[1] - ROWS + 1
+    if last < 1:
+        return np.ones(len(sensor))
+    more = np.all([same[:, k : k + last] for k in range(ROWS)], axis=0) & (valid[:, ROWS - 1 :, None] > 0)
+    rows = len(valid) + float(np.sum(valid))
+    return np.sqrt(rows / (rows - more.sum((0, 1))))
+
+
+def _channels(record: Record, model: mujoco.MjModel) -> np.ndarray:
+    """Position tangents from the first position, and velocities [N, T + 1, 2 nv]."""
+    first = record.qpos[0, 0]
+    away = jax.vmap(jax.vmap(lambda q: difference(model, q, first)))(record.qpos)
+    return np.concatenate([np.asarray(away, float), np.asarray(record.qvel, float)], axis=2)

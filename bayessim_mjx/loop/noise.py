@@ -1,4 +1,4 @@
-"""What the simulator does not explain of recorded motion: sensor noise, and forces that are not modelled.
+"""Noise of recorded motion: that of the sensors, and forces that are not modelled; starts under that noise.
 
 Estimated near a theta, by the linear dynamics there: what the simulator cannot follow counts as noise.
 """
@@ -9,22 +9,35 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from bayessim_mjx.kalman import Force, Gains, innovations, measured_noise, riccati
-from bayessim_mjx.loop.starts import Starts
+from bayessim_mjx.physics.tangent import difference, integrate
+from bayessim_mjx.tracking import Record
 
-FINEST = 1e-3  # of a channel's range of motion: no sensor is believed to be better
-PROCESS = (1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)  # of unmodelled forces, in the velocity's sensor noise
-FINER = (3.0**0.5, 3.0**0.25)  # what the most likely of them is multiplied and divided by after that
-LASTING = (0.7, 0.9, 0.97)  # their correlations from step to step
-RATIOS = (0.1, 0.3)  # velocity's sensor noise against position's, times what was given: less of it than was given
-TURNS, ALIKE = 6, 0.05  # steps of EM for the noise of single channels; relative change of a variance that is none
+FINEST = 1e-3  # of a channel's range of motion: no sensor is taken to be better; source: rule of thumb, not counted
+# grid of unmodelled forces, in units of the velocity's sensor noise. Without values between 1 and 10 the noise went to
+# and fro on a servo's logs. source: commit 4454ff8
+PROCESS = (1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
+# the most likely of them is multiplied and divided by these: a half and a quarter of a step of the grid; source: the
+# grid
+FINER = (3.0**0.5, 3.0**0.25)
+# grid of the forces' correlations from step to step. With white noise alone gusts of ten steps moved the damping by 2.8
+# standard deviations, with these by 1.5. source: commit 95be4ef, 16 cases
+LASTING = (0.7, 0.9, 0.97)
+RATIOS = (0.1, 0.3)  # grid of factors on the velocity's sensor noise alone; source: rule of thumb, not counted
+# steps of EM at most; relative change of a variance that ends them; source: rule of thumb, not counted
+TURNS, ALIKE = 6, 0.05
+# degrees of freedom: 1 / chi^2 of the N - 1 that an estimated mean leaves has the mean 1 / (N - 3).
+# source: exact (Stein); Morris 1983, eqs. 1.16 to 1.18
+LOST = 3
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What the simulator does not explain.
+    """Noise that the simulator does not explain.
 
     Attributes:
         sensor: `[2 nv]` standard deviations, positions first; inf where nothing is measured.
@@ -38,7 +51,7 @@ class Noise:
 
     @property
     def numbers(self) -> float:
-        """How many it has beside those of the sensors."""
+        """Count of its numbers beside those of the sensors."""
         return float(self.process.any()) + float(self.lasting > 0)
 
 
@@ -106,7 +119,7 @@ class NoiseModel:
     def likely(self, linear: Linear, otherwise: Noise) -> Noise:
         """The most likely noise, each number that is not needed left out (BIC): first what acts, then the sensors.
 
-        Sensors have one factor in common, or one each where that pays: one joint with a noise that nobody told, or
+        Sensors have one factor in common, or one each where that pays: one joint with an unknown noise, or
         with a friction that the simulator lacks, is no reason to believe the others less.
 
         `otherwise` where the dynamics are finite under none.
@@ -163,7 +176,7 @@ class NoiseModel:
         return noise
 
     def gains(self, ways: np.ndarray, noise: Noise) -> Gains:
-        """Of the filter along linear dynamics `ways` [N, T, 2 nv, 2 nv] under that noise."""
+        """Gains of the filter along linear dynamics `ways` [N, T, 2 nv, 2 nv] under that noise."""
         nothing = np.zeros(2 * self.nv)
         if noise.lasting:
             force = Force(noise.process, noise.lasting, self.dt)
@@ -197,4 +210,38 @@ class NoiseModel:
         return value, float(np.sqrt(factor))
 
 
-__all__ = ["FINEST", "Linear", "Noise", "NoiseModel"]
+class Starts:
+    """Measured starts of records, each channel by itself.
+
+    Attributes:
+        count: N.
+        away: `[N, 2 nv]` position tangents and velocities, from their means.
+    """
+
+    def __init__(self, record: Record, model: mujoco.MjModel) -> None:
+        self.record, self.model = record, model
+        qpos, qvel = record.qpos[:, 0], record.qvel[:, 0]
+        away = jax.vmap(lambda q: difference(model, q, qpos[0]))(qpos)
+        channels = np.concatenate([np.asarray(away, float), np.asarray(qvel, float)], axis=1)
+        self.count, self.away = len(channels), channels - channels.mean(0)
+
+    def share(self, sensor: np.ndarray) -> np.ndarray:
+        """[2 nv] of the measured spread that is noise of these standard deviations; 0 where nothing is measured."""
+        seen, freedom = np.isfinite(sensor), self.count - LOST
+        noise = freedom * np.where(seen, sensor, 0.0) ** 2
+        if freedom <= 0:
+            return np.zeros(len(sensor))
+        return np.minimum(noise / np.maximum((self.away**2).sum(0), 1e-300), 1.0)
+
+    def sd(self, sensor: np.ndarray) -> np.ndarray:
+        """[2 nv] standard deviations of what is left unknown of a start, over all of them."""
+        return sensor * np.sqrt(1 - self.share(sensor) * (1 - LOST / self.count) if self.count > LOST else 1.0)
+
+    def shrunk(self, sensor: np.ndarray) -> Record:
+        """The records, from their most likely starts under that noise of the sensors [2 nv]."""
+        nv, r = self.model.nv, self.record
+        step = jnp.asarray(-self.share(sensor) * self.away, jnp.float32)
+        qpos = jax.vmap(lambda q, by: integrate(self.model, q, by))(r.qpos[:, 0], step[:, :nv])
+        return r.replace(
+            qpos=jnp.asarray(r.qpos).at[:, 0].set(qpos), qvel=jnp.asarray(r.qvel).at[:, 0].add(step[:, nv:])
+        )

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -21,12 +22,15 @@ from bayessim_mjx.device import mesh
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.inference import InferenceSettings, rounds
 from bayessim_mjx.keys import branch
+from bayessim_mjx.loop import ranges
 from bayessim_mjx.loop.examination import reexamine
-from bayessim_mjx.loop.findings import PREDICTIVE_DRAWS, score
-from bayessim_mjx.loop.round_inference import blank, infer
+from bayessim_mjx.loop.round_inference import PREDICTIVE_DRAWS, infer, new_network, score
 from bayessim_mjx.loop.sources import Recorded, make_source
-from bayessim_mjx.loop.state import KEPT_ROUNDS, Loop, LoopState, RoundInfo
+from bayessim_mjx.loop.state import KEPT_ROUNDS, Loop, LoopState, RoundInfo, domain_or_prior
+from bayessim_mjx.loop.trajectories import no_motion
+from bayessim_mjx.parameters.ranged import Ranged
 from bayessim_mjx.rl import Policy, TrainState
 from bayessim_mjx.rl.recurrent import remembering
 
@@ -37,7 +41,7 @@ __all__ = [
 
 
 class Monitor(Protocol):
-    """What the loop tells while it runs; every method may do nothing."""
+    """Observer of the loop while it runs; every method may do nothing."""
 
     def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None: ...
     def round(self, info: RoundInfo, policy: Policy) -> None: ...
@@ -95,6 +99,43 @@ def init(loop: Loop, trains: bool = True) -> LoopState:
     fields = blank(loop)
     policy = _new_policy(loop, 0, fields["domain"], rl.start if trains else rl.init)
     return LoopState(round=jnp.int32(0), train=policy, **fields)
+
+
+def blank(loop: Loop) -> dict[str, Any]:
+    """The inference's fields of a LoopState before the first round: no data, the prior as domain."""
+    b, space, d = loop.settings, loop.space, len(loop.env.space)
+    domain = domain_or_prior(space, b.components, loop.chart)
+    infers = b.modelClass is not None
+    capacity, real_rows = (loop.capacity, b.realIters * b.realTrajs) if infers else (0, 0)
+    return {
+        "domain": domain,
+        "fit": new_network(loop, 0, space) if infers else None,
+        "thetas": jnp.zeros((capacity, d)),
+        "features": jnp.zeros((capacity, loop.feature_size)),
+        "real_features": jnp.zeros((real_rows, loop.feature_size)),
+        "real_posteriors": _no_factors(loop, real_rows) if infers else None,
+        **_no_proposals(loop),
+        "temperature": jnp.float32(1.0),
+        "moving": ranges.unmoved(space) if isinstance(space, Ranged) else None,
+        "motion": no_motion(loop, real_rows) if infers and loop.refines else None,
+        "standing": domain if infers else None,
+        "standing_gain": jnp.float32(-jnp.inf) if infers else None,
+        "standing_round": jnp.int32(0) if infers else None,
+    }
+
+
+def _no_factors(loop: Loop, rows: int) -> Distribution:
+    settings = InferenceSettings.of(loop.settings).at(loop.env.space)
+    factor = Distribution.prior(loop.space, settings.components * settings.ensemble, settings.chart)
+    return jax.tree.map(lambda leaf: jnp.zeros((rows, *leaf.shape)), factor)
+
+
+def _no_proposals(loop: Loop) -> dict[str, Any]:
+    if not loop.sequential:
+        return {"proposal": None, "proposals": None}
+    b = loop.settings
+    prior = rounds.first(loop.space, b.proposal, b.components, loop.chart)
+    return {"proposal": prior, "proposals": rounds.repeated(prior, max(1, loop.capacity // b.trainTrajs))}
 
 
 def _new_policy(
@@ -207,7 +248,7 @@ def run(
 
 
 def tree_of(loop: Loop, state: LoopState) -> dict[str, Any]:
-    """What a checkpoint holds; also the template to restore one."""
+    """Contents of a checkpoint; also the template to restore one."""
     return {"policy": rl.policy_of(state.train), "state": state}
 
 
@@ -219,5 +260,5 @@ def checkpoint_step(loop: Loop, round_: int, trained: TrainState) -> int:
 
 
 def meta_of(state: LoopState) -> dict[str, int]:
-    """What a checkpoint says of itself beside its arrays."""
+    """Numbers that a checkpoint keeps beside its arrays."""
     return {"round": int(state.round), "iteration": int(state.train.iteration)}

@@ -1,19 +1,87 @@
-"""The posterior that a run ended with, for whoever draws physics from it: play, wrappers, a program of one's own."""
+"""The posterior of all real trajectories: posteriors of single ones, their product, and the stored one of a run."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from bayessim_mjx import inference
 from bayessim_mjx.config import Config
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
-from bayessim_mjx.loop.state import chart_of
+from bayessim_mjx.inference import rounds
+from bayessim_mjx.inference.temperature import widened
+from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, chart_of, space_of
+from bayessim_mjx.loop.trajectories import at
 from bayessim_mjx.parameters.ranged import Ranged
+from bayessim_mjx.quantities import percent
+from bayessim_mjx.rollout import select
 from bayessim_mjx.runs import checkpoints
+
+LOST = 0.05  # mean weight that cannot be divided by the proposal: more is a warning; source: rule of thumb, not counted
+
+
+def condition(loop: Loop, state: LoopState) -> tuple[LoopState, Answer, Evidence]:
+    """Multiply the posteriors of all real trajectories so far."""
+    factors, warnings = _factors(loop, state)
+    state = dataclasses.replace(state, real_posteriors=factors)
+    product, lost = multiplied(loop, state, (int(state.round) + 1) * loop.settings.realTrajs)
+    if lost:
+        warnings.append(f"{lost} real trajectories left out: their posteriors are no densities")
+    return state, Answer(product), Evidence(warnings=warnings)
+
+
+def _factors(loop: Loop, state: LoopState) -> tuple[Distribution, list[str]]:
+    """q(theta | x) of every real trajectory, leaves [real trajectories, ...], and warnings about them."""
+    b, seen, warnings = loop.settings, int(state.round) * loop.settings.realTrajs, []
+    factors = conditioned(state.fit, state.real_features, state.temperature)
+    if b.proposal == "division":
+        assert state.proposals is not None
+        rows = jax.tree.map(np.asarray, factors).split()
+        done = seen + b.realTrajs
+        quotients, lost = rounds.divided(rows[:done], at(state.proposals, 0))
+        factors = jax.tree.map(lambda *leaves: jnp.stack(leaves), *quotients, *rows[done:])
+        if lost > LOST:
+            warnings.append(f"{percent(lost)} of the posterior's weight cannot be divided by the proposal")
+    factors = kept(factors, state.fit.identified, b.priorShare)
+    if loop.source.policy_dependent:  # type: ignore[union-attr]
+        # an older trajectory was made by an older policy: its posterior stays that of the network of its time
+        factors = select(jnp.arange(factors.logits.shape[0]) >= seen, factors, state.real_posteriors)
+    return factors, warnings
+
+
+@jax.jit
+def conditioned(network: Any, features: Array, widening: Array) -> Distribution:
+    """Batched posteriors of summaries [n, D], widened."""
+    return widened(inference.condition(network, features), widening)
+
+
+@jax.jit
+def kept(factors: Distribution, identified: Array, prior_share: float) -> Distribution:
+    """The prior where nothing is identified, and a share of it everywhere."""
+    factors = jax.vmap(inference.restore_prior, in_axes=(0, None))(factors, identified)
+    return dataclasses.replace(factors, prior_weight=jnp.full_like(factors.prior_weight, prior_share))
+
+
+def multiplied(loop: Loop, state: LoopState, known: int) -> tuple[Distribution, int]:
+    """The product of the factors of the first `known` real trajectories, and how many are no densities: left out."""
+    b = loop.settings
+    # on the host: an index on the device compiles each time
+    rows = jax.tree.map(np.asarray, state.real_posteriors).split()
+    usable = [row for row in rows[:known] if row.sound]
+    if not usable:
+        return Distribution.prior(space_of(loop, state), b.components, loop.chart), known
+    return inference.combine(usable, b.components).rechart(loop.chart), known - len(usable)
 
 
 def restored(checkpoint: Path, env: Env, config: Config) -> Distribution | None:
-    """What a checkpoint's next round would draw physics from; None where it is not one of the adaptive loop.
+    """The domain of a checkpoint, for a program that draws physics from it; None where the loop did not write it.
 
     Args:
         checkpoint: its folder.

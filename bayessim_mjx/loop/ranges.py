@@ -73,8 +73,8 @@ def room(loop: Loop, state: LoopState) -> tuple[LoopState, int, int]:
     moving = state.moving
     row = int(moving.next) if int(moving.next) + n <= loop.capacity else 0
     count = max(int(moving.rows), row + n)
-    told = {"rows": count if loop.capacity else 0, "next": row + n, "slot": row // n}
-    moving = moving.replace(**{k: jnp.int32(v) for k, v in told.items()})  # type: ignore[attr-defined]
+    fields = {"rows": count if loop.capacity else 0, "next": row + n, "slot": row // n}
+    moving = moving.replace(**{k: jnp.int32(v) for k, v in fields.items()})  # type: ignore[attr-defined]
     return dataclasses.replace(state, moving=moving), row, count
 
 
@@ -98,8 +98,8 @@ def move(loop: Loop, state: LoopState, posterior: Distribution) -> tuple[Distrib
     if state.moving is None or last or not (found := range_ends.piles(posterior)):
         return posterior, (), Evidence()
     before = state.moving.space
-    space, told = range_ends.moved(before, found, *limits_of(loop.env))
-    moves = tuple(told)
+    space, found = range_ends.moved(before, found, *limits_of(loop.env))
+    moves = tuple(found)
     if space.same(before):
         return posterior, moves, Evidence({"moves": moves})
     rows = jnp.int32(_kept(loop, state.moving, range_ends.share(before, space)))
@@ -120,7 +120,7 @@ def _kept(loop: Loop, moving: Moving, share: float) -> int:
 
 
 def _forgotten(factors: Distribution | None, space: Ranged) -> Distribution:
-    """As many factors that say nothing, over `space`."""
+    """The prior over `space` in place of each factor."""
     assert factors is not None
     ends = (
         jnp.broadcast_to(end, np.shape(old))

@@ -17,7 +17,7 @@ from bayessim_mjx.inference.summaries import Summarizer
 from bayessim_mjx.keys import branch
 from bayessim_mjx.logs import Channels, Log, noise, read_logs, segments
 from bayessim_mjx.logs.velocities import trusted
-from bayessim_mjx.loop.collection import Seen, tiled
+from bayessim_mjx.loop.collection import SummaryInputs, tiled
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import controllers
 from bayessim_mjx.physics.controllers import Law
@@ -26,7 +26,8 @@ from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, recording, remembered, replay
 from bayessim_mjx.tracking import Record
 
-ESTIMATED_SPEED = 3.0  # error of a velocity estimated from positions, in its noise part: it lags at transients
+# error of a velocity estimated from positions, in its noise: it lags at transients; source: rule of thumb, not counted
+ESTIMATED_SPEED = 3.0
 REPLAYED = 512  # segments replayed at once at nominal parameters
 
 
@@ -57,14 +58,14 @@ class Recorded:
         return len(self.order)
 
     @property
-    def channels(self) -> Seen:
-        """What the summarizer sees: deviations from the nominal replay, and commands; then come the first states."""
+    def channels(self) -> SummaryInputs:
+        """Inputs of the summarizer: deviations from the nominal replay, and commands; then come the first states."""
         named = Channels.of(self.env.mj_model)
         speeds = [f"{name} speed" for name in named.qvel]
         shown = [name for name, there in zip(speeds, self.fast, strict=True) if there]
         states = [f"deviation of {name}" for name in (*named.qpos, *shown)]
         first = tuple(f"first {name}" for name in (*named.qpos, *speeds))
-        return Seen(self.data["command"].shape[1], tuple(states), named.actuators, first)
+        return SummaryInputs(self.data["command"].shape[1], tuple(states), named.actuators, first)
 
     def features(self, index: Array | np.ndarray, qpos: Array, qvel: Array) -> Array:
         """[N, D] of measured motion qpos [N, T+1, nq], qvel [N, T+1, nv] under the commands of the segments index [N].
@@ -203,7 +204,7 @@ def apart(run: np.ndarray, start: np.ndarray, length: int) -> np.ndarray:
 
 
 def _expected(source: Recorded) -> dict[str, np.ndarray]:
-    """What the logs would show at nominal parameters: expected_qpos [M, T+1, nq], expected_qvel [M, T+1, nv]."""
+    """Logs that are expected at nominal parameters: expected_qpos [M, T+1, nq], expected_qvel [M, T+1, nv]."""
     count = len(source.pool)
     size = min(count, REPLAYED)
     thetas, found = tiled(jnp.asarray(source.space.nominal, jnp.float32), size), []

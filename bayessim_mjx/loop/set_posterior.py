@@ -20,27 +20,27 @@ from jax import Array
 from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference import restore_prior, set_network, sets
+from bayessim_mjx.inference import product_calibration, restore_prior, set_network
+from bayessim_mjx.inference.product_calibration import Count
 from bayessim_mjx.inference.rounds import REGION
-from bayessim_mjx.inference.sets import Count
 from bayessim_mjx.inference.temperature import tempered
 from bayessim_mjx.keys import branch
-from bayessim_mjx.loop.factors import conditioned, kept
-from bayessim_mjx.loop.simulations import features
+from bayessim_mjx.loop.examination import SETS
+from bayessim_mjx.loop.posterior import conditioned, kept
 from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round
+from bayessim_mjx.loop.trajectories import features
 from bayessim_mjx.quantities import fixed
 from bayessim_mjx.rl import Policy
 
-FITTED = 2000  # sets that the network is fitted on; other numbers were not measured
-JUDGED = 64  # sets that it and the product are judged on, as many as `sets` judges products on
+FITTED = 2000  # sets that the network is fitted on; source: rule of thumb, other numbers were not measured
 
 
 @dataclass(frozen=True)
 class SetPosterior:
-    """How the network of sets did on sets that it was not fitted on, and the product on the same.
+    """Results of the network of sets and of the product, on the same sets, which the network was not fitted on.
 
     Attributes:
-        network: of sets, so widened; see `sets.Count`.
+        network: of sets, so widened; see `product_calibration.Count`.
         product: of single posteriors, as it would be used.
         used: whether the posterior is that of the network.
     """
@@ -62,9 +62,11 @@ class SetPosterior:
     @property
     def scores(self) -> dict[str, float]:
         """Numbers for curves."""
-        told = {"used": float(self.used), "gain": self.network.gain, "product": self.product.gain}
-        told |= {"widening": self.network.widening}
-        return told | {f"coverage_{100 * level:.0f}": self.network.coverage(level) for level in sets.LEVELS}
+        numbers = {"used": float(self.used), "gain": self.network.gain, "product": self.product.gain}
+        numbers |= {"widening": self.network.widening}
+        return numbers | {
+            f"coverage_{100 * level:.0f}": self.network.coverage(level) for level in product_calibration.LEVELS
+        }
 
 
 def use_set_network(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
@@ -101,7 +103,7 @@ def _learnt(loop: Loop, state: LoopState, policy: Policy, answer: Answer) -> tup
         share = jnp.full_like(found.prior_weight, b.priorShare)
         return jax.tree.map(np.asarray, dataclasses.replace(found, prior_weight=share)).split()
 
-    thetas = dataclasses.replace(product, prior_weight=jnp.float32(0)).sample(k_theta, JUDGED)
+    thetas = dataclasses.replace(product, prior_weight=jnp.float32(0)).sample(k_theta, SETS)
     columns = [simulate(k, thetas) for k in keys]
 
     def used(q: Distribution) -> Distribution:
@@ -110,11 +112,13 @@ def _learnt(loop: Loop, state: LoopState, policy: Policy, answer: Answer) -> tup
     each = zip(np.asarray(thetas), posteriors(columns), _products(loop, state, columns, used), strict=True)
     rows = [(at, whole, other) for at, whole, other in each if other is not None and whole.sound]
     (own,) = posteriors([x[None] for x in real])
-    if len(rows) < JUDGED // 2 or not own.sound:
+    if len(rows) < SETS // 2 or not own.sound:
         raise UserError("too many simulated trajectories are not finite")
     at, wholes, products = zip(*rows, strict=True)
-    ours = sets.judge([[q] for q in wholes], np.stack(at), b.components).counts[0]
-    theirs = sets.judge([[q] for q in products], np.stack(at), b.components, widened_by=lambda n: 1.0).counts[0]
+    ours = product_calibration.judge([[q] for q in wholes], np.stack(at), b.components).counts[0]
+    theirs = product_calibration.judge(
+        [[q] for q in products], np.stack(at), b.components, widened_by=lambda n: 1.0
+    ).counts[0]
     posterior = tempered(inference.combine([own], b.components), ours.widening)
     return SetPosterior(ours, theirs, b.sets == "embedding" or ours.gain > theirs.gain), posterior
 
@@ -140,7 +144,7 @@ def _usable(loop: Loop, state: LoopState, product: Distribution) -> Array:
 def _products(
     loop: Loop, state: LoopState, columns: list[Array], used: Callable[[Distribution], Distribution]
 ) -> list[Distribution | None]:
-    """Of each set, given as columns of summaries [m, D], the product as it is used; None where it is no density."""
+    """Products of the sets, given as columns of summaries [m, D], as they are used; None where one is no density."""
     b, each = loop.settings, []
     for x in columns:
         factors = kept(conditioned(state.fit, x, state.temperature), state.fit.identified, b.priorShare)

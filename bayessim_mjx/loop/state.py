@@ -1,4 +1,4 @@
-"""What the outer loop is made of: its static parts, the state between rounds (the checkpoint), what a round tells."""
+"""Parts of the outer loop: static ones, the state between rounds (the checkpoint), the report of a round."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from bayessim_mjx.env import Env
 from bayessim_mjx.inference import InferenceSettings, checks, rounds
 from bayessim_mjx.inference.calibration import Report
 from bayessim_mjx.inference.misspecification import Misfit
+from bayessim_mjx.inference.product_calibration import Sets
 from bayessim_mjx.inference.range_ends import Pile
-from bayessim_mjx.inference.sets import Sets
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.sources import Source
 from bayessim_mjx.parameters import ParameterSpace
@@ -27,12 +27,13 @@ from bayessim_mjx.physics.contact import collides
 from bayessim_mjx.rl import Policy, TrainState
 from bayessim_mjx.rollout import Trajectory
 
-KEPT_ROUNDS = 4  # rounds of simulated trajectories kept for the fit where the collection policy does not change
+# rounds of simulations kept for the fit where the collection policy does not change; source: memory alone
+KEPT_ROUNDS = 4
 
 
 @flax.struct.dataclass
 class Moving:
-    """Where ranges may move: those of the next round, and which simulations were drawn from them."""
+    """Ranges of the next round where they may move, and the simulations that were drawn from them."""
 
     space: Ranged
     covered: Ranged  # what the simulations kept are draws of the prior over
@@ -58,14 +59,14 @@ class LoopState:
     temperature: Array  # [] factor on standard deviations that the last round's posterior was given
     motion: dict[str, Array] | None = None  # measured motion of the real trajectories, where bayessim.refine needs it
     moving: Moving | None = None  # None: all rounds have the ranges of the task
-    standing: Distribution | None = None  # the product used last, and what it gained on simulated sets (standing.py)
+    standing: Distribution | None = None  # the product used last, and what it gained on simulated sets (examination.py)
     standing_gain: Array | None = None  # [] nats
     standing_round: Array | None = None  # [] int32, the round that it comes from, from 1 on; 0: none was judged
 
 
 @dataclasses.dataclass
 class RoundInfo:
-    """What a person wants to see of a round; numbers on the host."""
+    """Report of a round; numbers on the host."""
 
     round: int
     rounds: int
@@ -81,8 +82,8 @@ class RoundInfo:
     seconds: dict[str, float]
     warnings: list[str]
     checks: checks.Checks | None = None  # calibration, misfit, ends of ranges; None: none asked for
-    sets: Any = None  # how products of several posteriors did on simulated sets, see inference/sets.py
-    refinement: Any = None  # what bayessim.refine made of the posterior, see loop/refinement.py
+    sets: Any = None  # how products of several posteriors did on simulated sets, see inference/product_calibration.py
+    refinement: Any = None  # what bayessim.refine made of the posterior, see likelihood_refinement.py
     set_posterior: Any = None  # how a network of sets did beside the product, see loop/set_posterior.py
     moves: tuple[Pile, ...] = ()  # ends of ranges at which the posterior piles up, and where they are in the next round
 
@@ -166,7 +167,7 @@ class Loop:
 
     @property
     def space(self) -> ParameterSpace:
-        """That of the first round."""
+        """Parameters with the ranges of the first round."""
         return Ranged(self.env.space) if self.moves else self.env.space
 
     @property
@@ -238,7 +239,7 @@ def space_of(loop: Loop, state: LoopState) -> ParameterSpace:
 
 
 def slot_of(loop: Loop, state: LoopState, done: int) -> int:
-    """Where the last of `done` rounds stands among the proposals and the simulations kept."""
+    """Slot of the last of `done` rounds among the kept proposals and simulations."""
     return (
         (done - 1) % max(1, loop.capacity // loop.settings.trainTrajs)
         if state.moving is None

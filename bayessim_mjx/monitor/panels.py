@@ -32,7 +32,7 @@ def triangle(figure: Any, draws: Draws, true: np.ndarray | None, top: float = 0.
                 continue
             if column == row:
                 marginal(axes, draws, row, true, limits[row])
-                axes.set_title(told(draws, row), fontsize=size, pad=3)
+                axes.set_title(median_in_words(draws, row), fontsize=size, pad=3)
             else:
                 joint(axes, draws, (column, row), true, (*limits[column], *limits[row]))
             axes.tick_params(labelsize=size - 0.5, length=2, pad=1.5)
@@ -194,7 +194,7 @@ def prior_range(draws: Draws, k: int) -> str:
     return " to ".join(compact(natural(draws, k, end[k]), 3) for end in (draws.low, draws.high))
 
 
-def told(draws: Draws, k: int) -> str:
+def median_in_words(draws: Draws, k: int) -> str:
     """`1.04 ± 0.06`, or median and 68 % interval, in the parameter's own unit."""
     n = draws.numbers
     return spread(n.median[k], n.low[k], n.high[k], n.sd[k])

@@ -16,9 +16,9 @@ from bayessim_mjx.monitor.panels import (
     label,
     limits_of,
     marginal,
+    median_in_words,
     natural,
     prior_range,
-    told,
     triangle,
     zoomed,
 )
@@ -137,7 +137,7 @@ def _facts(draws: Draws, true: np.ndarray | None, log_gain: float | None) -> str
     lines = []
     for k, width in enumerate(draws.numbers.width):
         unit = f" {draws.units[k]}" if draws.units[k] else ""
-        lines += [shorten(draws.names, 44)[k], f"    median, 68 %   {told(draws, k)}{unit}"]
+        lines += [shorten(draws.names, 44)[k], f"    median, 68 %   {median_in_words(draws, k)}{unit}"]
         lines += [f"    truth   {compact(natural(draws, k, true[k]))}{unit}"] if true is not None else []
         lines += [f"    posterior/prior sd   {width:.2g}", ""]
     lines += [f"correlation   {fixed(draws.numbers.correlation[0, 1], 2)}"]

@@ -21,14 +21,14 @@ class Lines:
 
     def __init__(self, file: TextIO, now: Callable[[], float] = time.monotonic):
         self.file, self.now, self.began = file, now, now()
-        self.stage, self.since, self.first, self.told = "", self.began, 0, 0.0
+        self.stage, self.since, self.first, self.reported = "", self.began, 0, 0.0
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         now = self.now()
         if stage != self.stage:
-            self.stage, self.since, self.first, self.told = stage, now, done, -EVERY
-        if now - self.told >= EVERY:
-            self.told = now
+            self.stage, self.since, self.first, self.reported = stage, now, done, -EVERY
+        if now - self.reported >= EVERY:
+            self.reported = now
             counted = f": {done} of {total}{self._left(now, done, total)}" if total > 1 else ""
             print(f"{now - self.began:6.1f} s  {stage}{counted}", file=self.file, flush=True)
 

@@ -19,7 +19,7 @@ def calibration(report: Any, *, round: int | None = None, sets: Any = None) -> A
     Args:
         report: inference.calibration.Report.
         round: for the heading.
-        sets: inference.sets.Sets, in a third picture: posteriors of several trajectories as they are used.
+        sets: inference.product_calibration.Sets, for a third picture: products as they are used.
     """
     figure = new_figure(11.0 if sets is None else 16.0, 5.2, layout="constrained")
     axes = figure.subplots(1, 2 if sets is None else 3)
@@ -48,8 +48,8 @@ def _coverage(axes: Any, report: Any) -> None:
     axes.set_title("coverage: below the band the posterior is too narrow, above too wide", fontsize=9, loc="left")
     axes.legend(loc="upper left", frameon=False, fontsize=8)
     rows = [f"{percent(a)}:  {percent_estimate(c, e, 1)}" for a, (c, e) in report.coverage.items()]
-    told = "\n".join(["observed coverage", *rows])
-    axes.text(0.97, 0.03, told, ha="right", va="bottom", fontsize=8, linespacing=1.4, transform=axes.transAxes)
+    text = "\n".join(["observed coverage", *rows])
+    axes.text(0.97, 0.03, text, ha="right", va="bottom", fontsize=8, linespacing=1.4, transform=axes.transAxes)
 
 
 def _sets(axes: Any, sets: Any) -> None:
@@ -70,7 +70,7 @@ def _sets(axes: Any, sets: Any) -> None:
         ylim=(0, 1.1), xlabel="trajectories", ylabel="share of true parameters inside (bands: ± 2 standard errors)"
     )
     title = "as used, on simulated sets; above: gain in nats"
-    axes.set_title("\n".join([title, *textwrap.wrap(sets.told, 56)]), fontsize=9, loc="left")
+    axes.set_title("\n".join([title, *textwrap.wrap(sets.saturation, 56)]), fontsize=9, loc="left")
     axes.legend(loc="lower left", frameon=False, fontsize=8)
 
 

@@ -12,14 +12,14 @@ def with_zeros(section: Mapping[str, Any], zeros: Mapping[str, float]) -> Mappin
         zeros: {attribute of dof_properties: what scaling takes for a number that is 0 in the model}.
     """
 
-    def told(setting: Any, zero: float) -> Any:
+    def with_zero(setting: Any, zero: float) -> Any:
         return {"zero": zero, **setting} if isinstance(setting, Mapping) else setting
 
     def inner(groups: Any) -> Any:
         dofs = groups.get("dof_properties") if isinstance(groups, Mapping) else None
         if not isinstance(dofs, Mapping):
             return groups
-        return {**groups, "dof_properties": {a: told(s, zeros[a]) if a in zeros else s for a, s in dofs.items()}}
+        return {**groups, "dof_properties": {a: with_zero(s, zeros[a]) if a in zeros else s for a, s in dofs.items()}}
 
     actors = section.get("actor_params")
     if not zeros or not isinstance(actors, Mapping):

@@ -37,9 +37,9 @@ def squares(stages: Mapping[str, Any], effects: bool = True) -> dict[str, float]
     """
     if not all(finite(stages.get(s)) for s in STEPS) or not stages["nominal"]:
         return {}
-    told = [s for s in STAGES if s != "with_effects" or effects]
-    told = [s for s in told if s != "reducible_floor" or stages.get("floor") in FLOORS]
-    return {s: (stages[s] / _largest(stages)) ** 2 for s in told if finite(stages.get(s))}
+    shown = [s for s in STAGES if s != "with_effects" or effects]
+    shown = [s for s in shown if s != "reducible_floor" or stages.get("floor") in FLOORS]
+    return {s: (stages[s] / _largest(stages)) ** 2 for s in shown if finite(stages.get(s))}
 
 
 def _largest(stages: Mapping[str, Any]) -> float:

@@ -45,8 +45,8 @@ TILES = {
 def top(d: Diagnosis) -> dict[str, Any]:
     """Verdict, sentences, what to do next and the key numbers."""
     verdict, stages, said = verdict_of(d), stages_of(d), d.sentences[1:]
-    told = [s for s in TILES if s in stages_told(d) and finite(stages[s])]
-    tiles = [{"words": TILES[s], "colour": STAGE[s], **_tile(d, s)} for s in told]
+    shown = [s for s in TILES if s in stages_told(d) and finite(stages[s])]
+    tiles = [{"words": TILES[s], "colour": STAGE[s], **_tile(d, s)} for s in shown]
     closed = gap_closed(stages)
     if finite(closed):
         words = f"of the squared gap {'that repeats' if repeated(d) else 'above the noise'} closed"
@@ -136,8 +136,8 @@ def _stages_row(row: Mapping[str, Any], joints: int) -> dict[str, Any]:
 
 def _table(d: Diagnosis, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Rows and those of the stages that some row knows; the floor where runs were repeated, the noise is 1 sd."""
-    told = {s for s in stages_told(d) if s != "noise_floor"}
-    known = [s for s in STAGES if s in told and any(r["cells"][s]["value"] != MISSING for r in rows)]
+    shown = {s for s in stages_told(d) if s != "noise_floor"}
+    known = [s for s in STAGES if s in shown and any(r["cells"][s]["value"] != MISSING for r in rows)]
     return {"rows": rows, "stages": known, "closed": any(r["closed"] != MISSING for r in rows), "heads": MORE}
 
 
@@ -287,11 +287,11 @@ def where(d: Diagnosis) -> dict[str, Any]:
 
 def _link(x: Mapping[str, Any]) -> dict[str, Any]:
     """A link of the chain; its verdict without the name and the numbers that stand beside it."""
-    head, _, rest = (told := str(x.get("verdict") or "")).partition(": ")
-    told = (rest if "->" in head and rest else told).rpartition(" (corr ")[0] or (rest if "->" in head else told)
+    head, _, rest = (words := str(x.get("verdict") or "")).partition(": ")
+    words = (rest if "->" in head and rest else words).rpartition(" (corr ")[0] or (rest if "->" in head else words)
     return {
         "name": str(x["name"]).replace("->", "→"),
-        "verdict": told,
+        "verdict": words,
         "slope": number(x.get("slope")),
         "correlation": number(x.get("correlation"), 4),
         "lag": estimate(x.get("lag"), in_unit="s") if finite(x.get("lag")) else MISSING,

@@ -111,9 +111,9 @@ def _effects(d: Diagnosis) -> Table:
 
 def _rivals(e: FoundEffect) -> str:
     """The effect's relative score and then its rivals with theirs, where they have one; nothing where there is none."""
-    told = [percent(e.weight_among_rivals)] if finite(e.weight_among_rivals) else []
+    shares = [percent(e.weight_among_rivals)] if finite(e.weight_among_rivals) else []
     rivals = [(candidate_title(r), r.get("weight")) for r in e.equivalent_to]
-    return "; ".join([*told, *(f"{name} {percent(weight)}" if finite(weight) else name for name, weight in rivals)])
+    return "; ".join([*shares, *(f"{name} {percent(weight)}" if finite(weight) else name for name, weight in rivals)])
 
 
 def _parameters(d: Diagnosis) -> Table:

@@ -105,8 +105,8 @@ class FreshEpisodes(Wrapper):
 
         fresh = jax.lax.cond(empty, renewed, lambda: store.state)
         begun = next_episodes(self._source, ended, ours, fresh)
-        told = {name: ours.info[name] for name in begun.info}
-        new, old = (begun.pipeline_state, begun.obs, begun.info), (ours.pipeline_state, ours.obs, told)
+        info = {name: ours.info[name] for name in begun.info}
+        new, old = (begun.pipeline_state, begun.obs, begun.info), (ours.pipeline_state, ours.obs, info)
         world, obs, kept = select(ended, new, old)
         left = Store(jnp.where(empty, key, store.key), fresh, (store.used & ~empty) | ended)
         return after.replace(pipeline_state=world, obs=obs, info={**after.info, OURS: kept, STORE: left})

@@ -1,6 +1,7 @@
 """Do 90 % intervals hold where a data sheet is less accurate than assumed, and on few or poor logs?
 
     python benchmarks/diagnosis/count_intervals.py run OUT --jobs 64 --minutes 9 [--only sheets] [--shard 0/2]
+    python benchmarks/diagnosis/count_intervals.py isolable OUT --jobs 64 --minutes 9   # of what has a result
     python benchmarks/diagnosis/count_intervals.py score OUT [--before OTHER]
 
 `counted_cases.py` fixes the cases: 150 of data sheets, 60 of poor logs, 90 outside the library. Rules, fixed before
@@ -18,6 +19,9 @@ any case was diagnosed:
   A false name is one that is not hidden. A verdict that names nothing, or a command that fails, names nothing.
   Cases in which a hidden effect is weaker than 80 % of what was asked for are left out of these rates, and counted.
   The size of a set is the number of its effect@place, mean over the answers that name something.
+- **Isolable** is a case if, by its truth alone, every other cause of the generator leaves something of each hidden
+  effect, and known parameters do that are free within 90 % of their nominal values (`lookalikes.py`; no accuracy is
+  stated). An effect that is a known parameter by another name (viscous friction, armature) never is.
 - **Strengths.** Parameters of rightly named effects, where they mean the same in reality and library (not those of base
   flexibility, external force and load friction). An interval is mean +- 1.645 sd. A parameter at a bound or without sd
   is a miss, unless it says "at least" or "at most" and that holds.
@@ -46,10 +50,11 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-RESULT, PLAN = "result.json", "plan.json"
+RESULT, PLAN, RIVALS = "result.json", "plan.json", "isolable.json"
 # CPU seconds of one single with an empty compilation cache (machine C; the servo arm's was not ended), for the order
 # alone; a double is taken to last twice as long
 SECONDS = {"pendulum": 67, "cartpole": 109, "two_link": 141, "leg": 187, "arm_servo": 450, "arm_torque": 282}
+DONE, ONE = {"run": RESULT, "isolable": RIVALS}, {"run": "one", "isolable": "rivals"}
 THREADS = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
 ALONE = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
@@ -83,6 +88,15 @@ def one(folder: Path, more: list[str]) -> None:
     _write(folder / RESULT, result)
 
 
+def rivals(folder: Path) -> None:
+    """Which other causes explain the same motion as the hidden effects of a case with a result."""
+    from counted_cases import Plan, rivals_of
+
+    given = json.loads((folder / PLAN).read_text())
+    truth = json.loads((folder / RESULT).read_text())["truth"]
+    _write(folder / RIVALS, rivals_of(Plan(**given | {"effects": tuple(given["effects"])}), truth))
+
+
 def _closed(found: Any, case: Any, seed: int) -> float | None:
     import fresh
 
@@ -111,7 +125,7 @@ def run(args: argparse.Namespace) -> None:
                 if process.poll() is not None:
                     del running[core]
                     free.append(core)
-                    print(f"{time.monotonic() - begun:4.0f} s {_line(folder)}", flush=True)
+                    print(f"{time.monotonic() - begun:4.0f} s {_line(folder, args.does)}", flush=True)
             time.sleep(0.2)
     finally:
         for process, _, _ in running.values():
@@ -125,27 +139,33 @@ def _waiting(args: argparse.Namespace) -> list[Path]:
     index, count = (int(n) for n in args.shard.split("/"))
     chosen = [*frozen()] if args.only == "frozen" else [p for p in plans() if args.only in ("all", p.group)]
     chosen = [p for p in chosen if p.system in args.systems.split(",")] if args.systems else chosen
+    if args.does == "isolable":
+        chosen = [p for p in chosen if p.group != "outside" and (args.out / p.name / RESULT).exists()]
     chosen = sorted(chosen, key=lambda p: (-SECONDS[p.system] * max(len(p.effects), 1), p.seed, p.name))[index::count]
     folders = []
     for plan in chosen:
         folder = args.out / plan.name
         folder.mkdir(parents=True, exist_ok=True)
         (folder / PLAN).write_text(json.dumps(dataclasses.asdict(plan)))
-        folders += [] if (folder / RESULT).exists() else [folder]
+        folders += [] if (folder / DONE[args.does]).exists() else [folder]
     return folders
 
 
 def _begin(folder: Path, core: int, args: argparse.Namespace) -> "subprocess.Popen[bytes]":
     flags = f"{os.environ.get('XLA_FLAGS', '')} {ALONE}".strip()
     alone = {"JAX_PLATFORMS": args.platforms, "XLA_FLAGS": flags, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | THREADS
-    command = [sys.executable, __file__, "one", str(folder), "--core", str(core), f"--more={args.more}"]
-    with (folder / "output.txt").open("w") as text:
+    command = [sys.executable, __file__, ONE[args.does], str(folder), "--core", str(core), f"--more={args.more}"]
+    with (folder / ("output.txt" if args.does == "run" else "rivals.txt")).open("w") as text:
         return subprocess.Popen(
             command, stdout=text, stderr=subprocess.STDOUT, env=os.environ | alone, start_new_session=True
         )
 
 
-def _line(folder: Path) -> str:
+def _line(folder: Path, does: str) -> str:
+    if does == "isolable":
+        found = json.loads((folder / RIVALS).read_text()) if (folder / RIVALS).exists() else []
+        closest = [f"{f['left']:.2f}, {r['name']}@{r['where']} {r['left']:.2f}" for f in found for r in f["rivals"][:1]]
+        return f"{folder.name}: {'; '.join(closest) or 'no result'}"
     if not (folder / RESULT).exists():
         return f"{folder.name}: no result"
     result = json.loads((folder / RESULT).read_text())
@@ -156,27 +176,33 @@ def _line(folder: Path) -> str:
     return f"{folder.name}: {said.get('verdict', 'no result')} {named} (hidden: {hidden}) {''.join(failed)}"
 
 
-def main() -> None:
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True, dest="does")
-    several = commands.add_parser("run", help="cases without a result")
-    several.add_argument("out", type=Path)
-    several.add_argument("--jobs", type=int, default=os.cpu_count(), help="cases at once, one core each")
-    several.add_argument("--minutes", type=float, default=1e6, help="when they are over, running cases are killed")
-    several.add_argument("--only", choices=("all", "sheets", "logs", "outside", "frozen"), default="all")
-    several.add_argument("--systems", default="", help="some robots, separated by commas; default all")
-    several.add_argument("--platforms", default="cpu", help="JAX's; 'cuda,cpu': all cases share a GPU")
-    several.add_argument("--shard", default="0/1", help="i/n: every n-th case, from the i-th")
-    single = commands.add_parser("one", help="one case in this process")
-    single.add_argument("folder", type=Path)
-    single.add_argument("--core", type=int)
-    for command in (several, single):
-        command.add_argument("--more", default="", help="further options of the command, as --more='--accuracy 5%%'")
-    told = commands.add_parser("score", help="tables of what came of all cases")
-    told.add_argument("out", type=Path)
-    told.add_argument("--before", type=Path, help="the same cases by another commit")
-    args = parser.parse_args()
-    if args.does == "run":
+    for name, text in (("run", "cases without a result"), ("isolable", "rivals of the hidden effects, by the truth")):
+        several = commands.add_parser(name, help=text)
+        several.add_argument("out", type=Path)
+        several.add_argument("--jobs", type=int, default=os.cpu_count(), help="cases at once, one core each")
+        several.add_argument("--minutes", type=float, default=1e6, help="when they are over, running cases are killed")
+        several.add_argument("--only", choices=("all", "sheets", "logs", "outside", "frozen"), default="all")
+        several.add_argument("--systems", default="", help="some robots, separated by commas; default all")
+        several.add_argument("--platforms", default="cpu", help="JAX's; 'cuda,cpu': all cases share a GPU")
+        several.add_argument("--shard", default="0/1", help="i/n: every n-th case, from the i-th")
+        several.add_argument("--more", default="", help="further options of the command, as --more='--accuracy 5%%'")
+    for name in ONE.values():
+        single = commands.add_parser(name, help="one case in this process")
+        single.add_argument("folder", type=Path)
+        single.add_argument("--core", type=int)
+        single.add_argument("--more", default="")
+    table = commands.add_parser("score", help="tables of what came of all cases")
+    table.add_argument("out", type=Path)
+    table.add_argument("--before", type=Path, help="the same cases by another commit")
+    return parser
+
+
+def main() -> None:
+    args = _parser().parse_args()
+    if args.does in ONE:
         run(args)
     elif args.does == "score":
         from counted_tables import tables
@@ -185,7 +211,7 @@ def main() -> None:
     else:
         if args.core is not None and hasattr(os, "sched_setaffinity"):
             os.sched_setaffinity(0, {args.core})  # before JAX counts the cores
-        one(args.folder, args.more.split())
+        one(args.folder, args.more.split()) if args.does == "one" else rivals(args.folder)
 
 
 if __name__ == "__main__":

@@ -35,11 +35,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cases import STRENGTHS, SYSTEMS, draw_cause, places, write
+from cases import KNOWN, STRENGTHS, SYSTEMS, draw_cause, places, write
 from isolable import KINDS, seed_of
 from turns import jobs
 
 from bayessim_mjx.blind.reality.cause import Cause
+from bayessim_mjx.blind.reality.lookalikes import APART, isolable, record, rivals
 from bayessim_mjx.blind.reality.motion import RUNS
 from bayessim_mjx.blind.reality.plant import Plant, Run, base_names, scales_of
 from bayessim_mjx.blind.reality.strength import Ruler, resize
@@ -51,6 +52,7 @@ SCALES = 0.02, 0.30  # ends of the scale of parameter errors
 STATED = 0.05  # the scale of the cases of poor logs: what the diagnosis assumes
 LEAST = 0.1  # of a nominal value: the smallest that a real one is
 WIDEST = 3.0  # scales, within which a refit may move known parameters when an effect's strength is measured
+FREE = 0.9  # of their nominal values, within which they are free where rivals are sought: no accuracy is stated
 
 OUTSIDE = {"null": range(9600, 9610), "unknown": range(9600, 9605)}
 
@@ -224,6 +226,25 @@ def again(plan: Plan, truth: dict[str, Any]) -> Drawn:
     for cause, told in zip(case.causes, truth["effects"], strict=True):
         cause.size = told["size"]
     return case
+
+
+def rivals_of(plan: Plan, truth: dict[str, Any]) -> list[dict[str, Any]]:
+    """Of each hidden effect {"left": encoder noises that known parameters leave of it, "rivals": see `rivals`}.
+
+    As if it were there alone, by all motions, however few the case logs.
+    """
+    case = again(plan, truth)
+    ruler = Ruler(case.robot, case.base, FREE, seed_of(plan.kind, plan.seed))
+    found = []
+    for cause in case.causes:
+        left = ruler.measure(record(cause, ruler))[1]
+        found.append({"left": left, "rivals": rivals(cause, ruler, KNOWN)})
+    return found
+
+
+def each_isolable(found: Sequence[dict[str, Any]]) -> bool:
+    """Whether known parameters leave something of each hidden effect, and every rival of it does."""
+    return all(f["left"] >= APART and isolable(f["rivals"], f["left"]) for f in found)
 
 
 def logged(plan: Plan, robot: System, runs: Sequence[Run], rng: np.random.Generator) -> list[Run]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from counted_cases import POOR, SEEDS, Plan, plans
+from counted_cases import POOR, SEEDS, Plan, each_isolable, plans
 from score import Outcome, label, mcnemar
 
 from bayessim_mjx.blind.outcome import LOOSE, alarm, covered, holds, labels_of, wilson
@@ -25,7 +25,7 @@ class Answer:
     """What one case adds to the tables; of one that did not end, nothing.
 
     rates: {measure: answers}; size: of the set, nan where nothing is named; untold: why something was not counted.
-    stated: (probability of the answer, whether it is what is hidden, and no more).
+    stated: (probability of the answer, whether it is what is hidden, and no more). isolable: None: not examined.
     """
 
     plan: Plan
@@ -36,6 +36,7 @@ class Answer:
     cpu: float = math.nan
     said: str = ""
     stated: tuple[float, bool] | None = None
+    isolable: bool | None = None
 
 
 def answers(out: Path) -> list[Answer]:
@@ -66,7 +67,10 @@ def answer(plan: Plan, folder: Path) -> Answer:
     untold += missing + more + [f"loose: {e['name']}" for e in o.truth["effects"] if e["name"] in LOOSE]
     state = "no result" if said is None else "ended"
     members = len(o.members()) if o.named() else math.nan
-    return Answer(plan, state, rates, members, tuple(untold), result.get("cpu", math.nan), label(o), stated(o))
+    apart = folder / "isolable.json"
+    alone = each_isolable(json.loads(apart.read_text())) if apart.exists() else None
+    cpu = result.get("cpu", math.nan)
+    return Answer(plan, state, rates, members, tuple(untold), cpu, label(o), stated(o), alone)
 
 
 def stated(o: Outcome) -> tuple[float, bool] | None:
@@ -132,11 +136,15 @@ def tables(out: Path, before: Path | None = None) -> str:
     by_error: list[Group] = [(f"{100 * e:g} %", lambda a, e=e: nearest(a.plan.scale) == e) for e in ERRORS]
     by_kind: list[Group] = [(k, lambda a, k=k: a.plan.kind == k) for k in ("single", "double")]
     by_system: list[Group] = [(s, lambda a, s=s: a.plan.system == s) for s in SEEDS]
+    examined: list[Group] = [
+        (f"{k}, {'' if own else 'not '}isolable", lambda a, k=k, own=own: a.plan.kind == k and a.isolable is own)
+        for k in ("single", "double") for own in (True, False)
+    ]  # fmt: skip
     by_logs: list[Group] = [(k, lambda a, k=k: a.plan.logs == k) for k in POOR]
     text = [
-        f"Data sheets of any accuracy\n\n{_table(sheets, [*by_kind, *by_system])}",
+        f"Data sheets of any accuracy\n\n{_table(sheets, [*by_kind, *examined, *by_system])}",
         f"By the scale of the true errors\n\n{_table(sheets, by_error)}",
-        f"Few and poor logs\n\n{_table(logs, by_logs)}",
+        f"Few and poor logs\n\n{_table(logs, [*by_logs, *examined[:2]])}",
         f"Nothing of the library\n\n{_outside(outside)}",
         f"Stated probabilities\n\n{_stated(every)}",
         _left_out(every),

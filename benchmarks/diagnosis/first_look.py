@@ -48,12 +48,12 @@ def rigs(seeds: Sequence[int], systems: Sequence[str] = SYSTEMS, effects: Sequen
 
 def judged(rig: Rig) -> dict[str, Any]:
     """One rig's row."""
-    from bayessim_mjx.diagnosis.equation_error.leads import proposed
-    from bayessim_mjx.diagnosis.equation_error.look import look
+    from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check
+    from bayessim_mjx.diagnosis.equation_error.proposals import proposed
 
     model, logs = record(rig)
     began = time.process_time()
-    seen = look(logs, model)
+    seen = check(logs, model)
     took = time.process_time() - began
     starts = proposed(seen)
     true = f"{rig.truth.effect}@{rig.truth.where}" if rig.truth.effect else ""
@@ -161,7 +161,7 @@ def published(data: Path) -> None:
     """What the look says of real logs with published truth (`NOTES.md` beside them), with data-sheet values at 5 %."""
     import real_logs
 
-    from bayessim_mjx.diagnosis.equation_error.look import look
+    from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check
     from bayessim_mjx.diagnosis.fitting import robot
     from bayessim_mjx.diagnosis.summary import first_look
     from bayessim_mjx.logs import read_logs
@@ -172,7 +172,7 @@ def published(data: Path) -> None:
             rig = robot.of_file(Path(folder) / "model.xml")
             logs = read_logs(str(Path(folder) / "logs"), rig.mj_model, None)
             began = time.process_time()
-            seen = look(logs, rig.mj_model)
+            seen = check(logs, rig.mj_model)
             print(f"{name} ({time.process_time() - began:.1f} CPU s)", *first_look.lines(seen), sep="\n  ")
 
 

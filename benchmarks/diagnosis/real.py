@@ -3,7 +3,7 @@
     python benchmarks/diagnosis/real.py emps|xl330|dfki --data DIR --out DIR
 
 Converts the logs, runs `python -m bayessim_mjx.diagnose` on them and compares what it says with what was published.
-What is measured is defined in the NOTES.md beside the data; ../results.md has the figures.
+What is measured is defined in the NOTES.md beside the data; ../records/robots_*.json have the figures.
 """
 
 from __future__ import annotations

@@ -23,9 +23,9 @@ from noise_draws import scored
 
 from bayessim_mjx import cli, config, loop
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import InferenceSettings, fit, init, sets
-from bayessim_mjx.loop.factors import conditioned, kept
-from bayessim_mjx.loop.simulations import features, simulated
+from bayessim_mjx.inference import InferenceSettings, fit, init, product_calibration
+from bayessim_mjx.loop.posterior import conditioned, kept
+from bayessim_mjx.loop.trajectories import features, simulated
 from bayessim_mjx.registry import make
 
 FRESH = 500  # pairs that score a network
@@ -43,18 +43,18 @@ def factors_of(state: Any, columns: list[jax.Array], share: float) -> tuple[list
     return [rows[i] for i in good], good
 
 
-def widening(found: sets.Sets, trajectories: int) -> float:
+def widening(found: product_calibration.Sets, trajectories: int) -> float:
     """The factor that these sets asked for."""
     return found.at(trajectories).widening
 
 
-def told(found: sets.Sets) -> dict[str, Any]:
+def told(found: product_calibration.Sets) -> dict[str, Any]:
     """Of products of each number of trajectories."""
     return {
         c.trajectories: {
             "gain": round(c.gain, 2), "se": round(c.error, 2),
             "unwidened": round(c.plain, 2), "widening": round(c.widening, 2),
-            "50/80/95": [round(float(np.mean(c.levels <= p)), 2) for p in sets.LEVELS],
+            "50/80/95": [round(float(np.mean(c.levels <= p)), 2) for p in product_calibration.LEVELS],
         }
         for c in found.counts
     }  # fmt: skip
@@ -103,12 +103,14 @@ def main() -> None:
         }
         factors = kept(conditioned(state, x[n:], jnp.float32(1)), state.identified, own.bayessim.priorShare)
         row["one"] = scored(keys[4], factors, thetas[n:])
-        judged: dict[str, sets.Sets] = {}
+        judged: dict[str, product_calibration.Sets] = {}
         for kind, where in at.items():  # the sets at the prior's draws say how products are widened
             rows, good = factors_of(state, columns[kind], own.bayessim.priorShare)
             by = judged.get("prior")
             widened = None if by is None else functools.partial(widening, by)
-            judged[kind] = sets.judge(rows, np.asarray(where)[good], own.bayessim.components, widened_by=widened)
+            judged[kind] = product_calibration.judge(
+                rows, np.asarray(where)[good], own.bayessim.components, widened_by=widened
+            )
             row[kind] = told(judged[kind])
         print(json.dumps(row), flush=True)
 

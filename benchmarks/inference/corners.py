@@ -27,10 +27,9 @@ from scipy.stats import norm
 
 from bayessim_mjx import config, loop
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import InferenceSettings, fit, init, near, sets
-from bayessim_mjx.inference.posterior import combine
+from bayessim_mjx.inference import InferenceSettings, combine, fit, init, local_recalibration, product_calibration
 from bayessim_mjx.inference.temperature import tempered
-from bayessim_mjx.loop.simulations import features
+from bayessim_mjx.loop.trajectories import features
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.registry import make
 
@@ -78,7 +77,7 @@ def summed(gains: list[float], levels: list[float]) -> dict[str, Any]:
     found = np.asarray(levels)
     return {
         "gain": round(float(np.mean(gains)), 2), "se": round(float(np.std(gains) / len(gains) ** 0.5), 2),
-        "50/80/95": [round(float(np.mean(found <= p)), 2) for p in sets.LEVELS],
+        "50/80/95": [round(float(np.mean(found <= p)), 2) for p in product_calibration.LEVELS],
     }  # fmt: skip
 
 
@@ -89,7 +88,7 @@ class Fitted:
     study: Study
     state: Any
     components: int
-    everywhere: sets.Sets
+    everywhere: product_calibration.Sets
 
     def drawn(self, key: jax.Array, thetas: jax.Array, n: int) -> tuple[list[list[Distribution]], np.ndarray]:
         """Factors of sets of n trajectories at thetas [m, d], and the thetas of those that have any."""
@@ -111,7 +110,7 @@ def fitted(study: Study, components: int, simulations: int, most: int, seed: int
     x = study.simulate(keys[1], thetas)
     state, info = fit(keys[3], init(keys[2], study.settings, study.space, x.shape[1]), thetas, x)
     print(json.dumps({"held out": round(float(info.log_q), 3)}), flush=True)
-    found = sets.judge(*drawn(study, state, keys[5], prior.sample(keys[5], SETS), most), components)
+    found = product_calibration.judge(*drawn(study, state, keys[5], prior.sample(keys[5], SETS), most), components)
     return Fitted(study, state, components, found)
 
 
@@ -130,7 +129,7 @@ def measured(one: Fitted, truths: jax.Array, n: int, key: jax.Array) -> dict[str
             own = jax.random.fold_in(jax.random.fold_in(key, i), 10 * n + turn)
             return one.drawn(own, posterior.sample(own, SETS), n)
 
-        settled.append(near.settled(found, product, around, k))
+        settled.append(local_recalibration.recalibrated(found, product, around, k))
         clock += time.perf_counter() - began
         wide = tempered(product, found.widening(n))
         for kind, q in {"as it is": product, "prior": wide, "here": settled[-1].used(product, n)}.items():
@@ -159,7 +158,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args, more = parser.parse_known_args()
     if args.still:
-        near.CHANCE = 0.0
+        local_recalibration.CHANCE = 0.0
     own = args.problem == "linear"
     fixed = ["bayessim.collectPolicy=policy_random", "bayessim.refine=off", *more]
     settings = config.load("Pendulum" if own else args.problem, overrides=fixed)

@@ -4,8 +4,9 @@
 
 The cart of refinement.py, whose positions are linear in two motors' strengths and the start. Positions are rounded to
 counts, and the posterior takes their errors for white noise of a count / sqrt 12: as they are, and with the factor of
-`loop/travel.repeated`, by which at most four rows of each run of equal values tell. Starts are free, 4 trajectories a
-set. The table has the root mean squares of z (1 where calibrated) and how often regions of 50, 80, 95 % hold the truth.
+`loop/likelihood.repeated`, by which at most four rows of each run of equal values count. Starts are free, 4
+trajectories a set. The table has the root mean squares of z (1 where calibrated) and how often regions of 50, 80, 95 %
+hold the truth.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import argparse
 import numpy as np
 from scipy.linalg import expm
 
-from bayessim_mjx.loop.travel import ROWS
+from bayessim_mjx.loop.likelihood import ROWS
 
 MASS, DAMPING, STIFFNESS, GAINS = 2.0, 1.0, 4.0, (10.0, 5.0)
 SECONDS, HELD, TRAJECTORIES = 2.4, 0.2, 4

@@ -1,4 +1,4 @@
-"""How many independent draws a Gaussian of a refined posterior has to stand on (`inference.weighted.FEWEST`).
+"""How many independent draws a Gaussian of a refined posterior has to stand on (`inference.mixture_fit.FEWEST`).
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/inference/few_draws.py --samples 40
 
@@ -14,8 +14,9 @@ import numpy as np
 from scipy.stats import multivariate_t, norm
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import weighted
-from bayessim_mjx.inference.pareto import effective, smoothed
+from bayessim_mjx.inference import mixture_fit
+from bayessim_mjx.inference.final_importance_sampling import smoothed
+from bayessim_mjx.inference.smc import ess_of
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 TOLD, FREE, MOST, JUDGES = 5, 4, 8, 2000
@@ -61,28 +62,28 @@ def judged(kind: str, seed: int, count: int) -> tuple[float, list[tuple[int, flo
     judges, found = jnp.asarray(drawn(kind, rng, JUDGES).clip(0, 1), jnp.float32), []
     for limit in LIMITS:
         own = np.random.default_rng([seed, 1])
-        q = weighted.in_cube(lambda at, own=own, limit=limit: fitted(own, u[:, at], w, limit), u, effective(w), w)
+        q = mixture_fit.in_cube(lambda at, own=own, limit=limit: fitted(own, u[:, at], w, limit), u, ess_of(w), w)
         fit = Distribution.from_unit(SPACE, np.log(q.weights), q.means, np.linalg.cholesky(q.covariances))
         levels = np.asarray(fit.credible_level(judges))
         found.append(
             (len(q.weights), float(fit.log_gain(judges).mean()), [float(np.mean(levels <= p)) for p in LEVELS])
         )
-    return effective(w), found
+    return ess_of(w), found
 
 
-def fitted(rng: np.random.Generator, z: np.ndarray, w: np.ndarray, limit: int) -> weighted.Mixture:
-    """`weighted.fitted`, whose number of Gaussians asks for FEWEST as ever and whose check asks for `limit`."""
-    supported, kept = weighted.supported, weighted.FEWEST
+def fitted(rng: np.random.Generator, z: np.ndarray, w: np.ndarray, limit: int) -> mixture_fit.Mixture:
+    """`mixture_fit.fitted`, whose number of Gaussians asks for FEWEST as ever and whose check asks for `limit`."""
+    supported, kept = mixture_fit.supported, mixture_fit.FEWEST
 
-    def check(rng: np.random.Generator, z: np.ndarray, w: np.ndarray, k: int) -> weighted.Mixture:
-        weighted.FEWEST = limit
+    def check(rng: np.random.Generator, z: np.ndarray, w: np.ndarray, k: int) -> mixture_fit.Mixture:
+        mixture_fit.FEWEST = limit
         return supported(rng, z, w, k)
 
     try:
-        weighted.supported = check
-        return weighted.fitted(rng, z, w, MOST)
+        mixture_fit.supported = check
+        return mixture_fit.fitted(rng, z, w, MOST)
     finally:
-        weighted.supported, weighted.FEWEST = supported, kept
+        mixture_fit.supported, mixture_fit.FEWEST = supported, kept
 
 
 def main() -> None:

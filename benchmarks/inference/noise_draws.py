@@ -24,7 +24,7 @@ from bayessim_mjx import config, loop
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import Again, InferenceSettings, calibration, condition, fit, init
 from bayessim_mjx.inference.checks import conditioned
-from bayessim_mjx.loop.simulations import simulated
+from bayessim_mjx.loop.trajectories import simulated
 from bayessim_mjx.registry import make
 
 FRESH = 1000  # pairs that score a network

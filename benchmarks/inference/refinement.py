@@ -37,7 +37,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.logs import Channels, Log, estimate_velocity, noise
 from bayessim_mjx.logs.signals import noise_level
 from bayessim_mjx.loop.likelihood import Likelihood
-from bayessim_mjx.loop.refinement import refine
+from bayessim_mjx.loop.likelihood_refinement import refine
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.tangent import in_tangent

@@ -23,7 +23,16 @@ import numpy as np
 from problems import PROBLEMS, Problem
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import Again, InferenceSettings, combine, condition, fit, init, set_network, sets
+from bayessim_mjx.inference import (
+    Again,
+    InferenceSettings,
+    combine,
+    condition,
+    fit,
+    init,
+    product_calibration,
+    set_network,
+)
 from bayessim_mjx.inference.temperature import tempered
 
 LEVELS = (0.5, 0.8, 0.95)
@@ -69,7 +78,7 @@ def rows_of(problem: Problem, counts: list[int], truths: int, simulations: int, 
     network = trained(problem, simulations)
     most = max(counts)
     at, x = recorded(problem, jax.random.PRNGKey(3), SETS, most)
-    widening = sets.judge([factors(network, each) for each in x], np.asarray(at), COMPONENTS)
+    widening = product_calibration.judge([factors(network, each) for each in x], np.asarray(at), COMPONENTS)
     told = {c.trajectories: (round(c.widening, 2), round(c.gain, 2)) for c in widening.counts}
     print(
         problem.name, "network and sets", round(time.process_time() - clock, 1), "s; widening, gain", told, flush=True

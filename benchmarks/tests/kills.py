@@ -48,7 +48,7 @@ COMMANDS = {
 }  # fmt: skip
 MODULES = {"refine": "main"}  # of those commands that have another name
 # files of a process that is refining a posterior
-REFINING = ("loop/refin", "loop/likelihood", "inference/importance", "inference/moves", "tracking")
+REFINING = ("loop/likelihood", "inference/importance", "inference/smc", "tracking")
 MOST = 8  # kills of one run
 MOST_SAVES = 4  # that a process lives to see
 NEXT_SAVE = 0.6  # s after one, in which the next one is begun

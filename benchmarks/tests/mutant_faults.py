@@ -143,7 +143,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     # inference
     (
-        "regions hold the share of draws that are less dense", f"{P}/inference/coverage_factor.py",
+        "regions hold the share of draws that are less dense", f"{P}/inference/temperature.py",
         "density[1:] > density[0], density", "density[1:] < density[0], density",
         ("tests/inference/test_coverage_factor.py", "-k", "chi_square"),
     ),
@@ -153,7 +153,8 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         ("tests/inference/test_identify.py", "-k", "by_hand"),
     ),
     (
-        "Matern features with a Gaussian spectrum", f"{P}/inference/features.py", "if np.isfinite(nu):", "if False:",
+        "Matern features with a Gaussian spectrum", f"{P}/inference/densities/mdrff.py", "if np.isfinite(nu):",
+        "if False:",
         ("tests/inference/test_features.py",),
     ),
     # diagnosis

@@ -60,12 +60,12 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     # loop
     (
-        "the first of a round's real trajectories keeps the last round's posterior", f"{LOOP}/round_inference.py",
+        "the first of a round's real trajectories keeps the last round's posterior", f"{LOOP}/posterior.py",
         "jnp.arange(factors.logits.shape[0]) >= seen", "jnp.arange(factors.logits.shape[0]) > seen",
         SCORES,
     ),
     (
-        "standard deviations of the surrogate's parameters are squared", f"{LOOP}/surrogate.py",
+        "standard deviations of the surrogate's parameters are squared", f"{LOOP}/sources.py",
         "jnp.asarray(self.sds)[component] * noise_", "jnp.asarray(self.sds)[component] ** 2 * noise_",
         _tests("loop/test_sources", k="standard_deviations"),
     ),
@@ -79,7 +79,7 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         "clock = round_ * ppo.max_iterations * ppo.num_steps", "clock = 0 * round_ * ppo.num_steps", SCORES,
     ),
     (
-        "starts are drawn to their mean by N, not by N - 3", f"{LOOP}/starts.py",
+        "starts are drawn to their mean by N, not by N - 3", f"{LOOP}/noise.py",
         "freedom = np.isfinite(sensor), self.count - LOST", "freedom = np.isfinite(sensor), self.count",
         _tests("loop/test_starts", k="by_hand"),
     ),
@@ -88,11 +88,11 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         "shape = 0.5 * (self.count + 1)", "shape = self.count + 1", SCORES,
     ),
     (
-        "what a posterior gains is judged without the widening it has", f"{LOOP}/standing.py",
-        "else found.at(known).gain if", "else found.at(known).plain if", _tests("loop/test_standing"),
+        "what a posterior gains is judged without the widening it has", f"{LOOP}/examination.py",
+        "else found.at(known).gain if", "else found.at(known).plain if", _tests("loop/test_keep_or_replace"),
     ),
     (
-        "scores of neighbouring stretches count half", f"{LOOP}/refinement.py",
+        "scores of neighbouring stretches count half", f"{LOOP}/likelihood_refinement.py",
         "(1 - lag / (lags + 1)) * (both + both.T)", "(1 - lag / (lags + 1)) * both", SCORES,
     ),
     # inference
@@ -101,11 +101,12 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         "return q.means, q.scales * factor", "return q.means, q.scales * factor**2", BY_HAND,
     ),
     (
-        "a widening is judged on the sets that chose it", f"{INFERENCE}/sets.py", "_best(gains[:, part != p])",
+        "a widening is judged on the sets that chose it", f"{INFERENCE}/product_calibration.py",
+        "_best(gains[:, part != p])",
         "_best(gains[:, part == p])", BY_HAND,
     ),
     (
-        "the shape of a Pareto tail without its prior", f"{INFERENCE}/pareto.py",
+        "the shape of a Pareto tail without its prior", f"{INFERENCE}/final_importance_sampling.py",
         "return (n * shape + 10 * 0.5) / (n + 10), scale", "return shape, scale", BY_HAND,
     ),
     (
@@ -118,11 +119,12 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         _tests("inference/test_misspecification", k="combination"),
     ),
     (
-        "a product is moved by what chance adds too", f"{INFERENCE}/near.py", "return mean * (1 - chance / told), cov",
+        "a product is moved by what chance adds too", f"{INFERENCE}/local_recalibration.py",
+        "return mean * (1 - chance / statistic), cov",
         "return mean, cov", BY_HAND,
     ),
     (
-        "truncated draws are the posterior's, not the prior's", f"{INFERENCE}/proposal.py",
+        "truncated draws are the posterior's, not the prior's", f"{INFERENCE}/rounds.py",
         "jnp.exp(-wide.log_gain(theta)), 0.0", "1.0, 0.0", _tests("inference/test_proposal", k="truncated"),
     ),
     (
@@ -186,7 +188,7 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     (
         "an offset is turned round with the sign", f"{LOGS}/mapping.py",
-        "return self.sign * self.scale * raw + self.offset", "return self.sign * (self.scale * raw + self.offset)", MAP,
+        "return self.sign * scale, self.offset", "return self.sign * scale, self.sign * self.offset", MAP,
     ),
     (
         "the row before a gap belongs to what comes after it", f"{LOGS}/pieces.py",

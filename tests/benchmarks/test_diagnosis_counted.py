@@ -166,7 +166,7 @@ def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_pat
 
     monkeypatch.setattr(command, "_begin", sleep)
     args = argparse.Namespace(
-        out=tmp_path, jobs=1, minutes=0.01, only="sheets", systems="leg", shard="1/10", more="--accuracy 5%"
+        out=tmp_path, jobs=1, minutes=0.01, only="sheets", systems="leg", shard="1/10", more="--accuracy 5%", does="run"
     )
     for _ in range(2):
         command.run(args)
@@ -176,3 +176,23 @@ def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_pat
     (first / "result.json").write_text("{}")
     command.run(args)
     assert "1 cases" in capsys.readouterr().out and os.path.exists(first / "plan.json")
+
+
+def test_a_case_is_isolable_if_neither_known_parameters_nor_another_cause_do_the_work():
+    far, near = {"name": "joint_spring", "where": "hinge", "left": 5.0}, {"name": "cogging", "where": "m", "left": 0.4}
+    assert counted.each_isolable([{"left": 6.0, "rivals": [far]}])
+    assert not counted.each_isolable([{"left": 6.0, "rivals": [near, far]}])
+    assert not counted.each_isolable([{"left": 0.5, "rivals": [far]}])  # known parameters do it
+    assert not counted.each_isolable([{"left": 6.0, "rivals": [far]}, {"left": 0.5, "rivals": [far]}])
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+def test_viscous_friction_is_damping_and_never_isolable(plans):
+    plan = next(p for p in plans if p.name == "pendulum_single_s9308")
+    assert plan.effects == ("viscous_friction",)
+    case = counted.drawn(plan)
+    case.causes[0].size = 0.015
+    told = {"effects": [{"size": 0.015}]}
+    (found,) = counted.rivals_of(plan, told)
+    assert found["left"] < counted.APART and not counted.each_isolable([found])

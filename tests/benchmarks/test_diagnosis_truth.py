@@ -212,7 +212,7 @@ def test_a_cause_in_its_own_place_leaves_nothing_and_others_leave_more():
     scales = truth.scales_of(ruler.plain, ruler.runs)
     damper = cases.CAUSES["viscous_friction"]("hinge", scales, np.random.default_rng(0), 0.02)
     runs = lookalikes.record(damper, ruler)
-    gap = ruler.windows(ruler.plain, runs, every=lookalikes.EVERY)
+    gap = ruler.windows(ruler.plain, runs)
     left = {
         name: lookalikes._closest(cases.CAUSES[name](where, scales, np.random.default_rng(1)), ruler, runs, gap)
         for name, where in (("viscous_friction", "hinge"), ("joint_spring", "hinge"), ("actuator_bias", "hinge_motor"))
@@ -220,3 +220,13 @@ def test_a_cause_in_its_own_place_leaves_nothing_and_others_leave_more():
     whole = float(np.sqrt(np.mean(gap**2, axis=(0, 1))).max())
     assert left["viscous_friction"] < 0.1 * whole
     assert min(left["joint_spring"], left["actuator_bias"]) > 3 * left["viscous_friction"]
+
+
+def test_friction_does_not_do_the_work_of_a_limit_that_acts_in_few_windows():
+    ruler = pendulum_ruler()
+    scales = truth.scales_of(ruler.plain, ruler.runs)
+    limit = cases.CAUSES["actuator_saturation"]("hinge_motor", scales, np.random.default_rng(0))
+    limit.size = 0.1
+    acts = np.abs(ruler.windows(ruler.plain, lookalikes.record(limit, ruler))).max((1, 2)) > 1e-6
+    assert 0 < acts.mean() < 0.5
+    assert lookalikes.apart(limit, "coulomb_friction", "hinge", ruler) > lookalikes.APART

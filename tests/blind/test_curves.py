@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.blind import plan
-from bayessim_mjx.blind.amounts import AMOUNTS, amount_of, told, unit_of
+from bayessim_mjx.blind.amounts import AMOUNTS, amount_of, in_words, unit_of
 from bayessim_mjx.blind.curves import LAPSE, Curves, Trial, chance
 from bayessim_mjx.blind.findings import amount_at
 from bayessim_mjx.blind.reality.menu import KNOWN
@@ -98,10 +98,10 @@ def test_effects_and_places_take_turns():
 
 def test_amounts_grow_with_the_effect_and_are_told_in_its_units():
     assert set(AMOUNTS) == set(KNOWN)
-    assert amount_of("backlash", {"gap": 0.003}) == 0.003 and told("backlash", 0.003) == "0.17 deg"
-    assert told("backlash", 0.003, slide=True) == "3.0 mm" and told("actuator_delay", 0.004) == "4.0 ms"
-    assert amount_of("actuator_gain", {"gain": 0.7}) == pytest.approx(0.3) and told("actuator_gain", 0.3) == "30 %"
-    assert told("actuator_saturation", 0.5) == "2.0 N m" and unit_of("viscous_friction", False) == "N m s/rad"
+    assert amount_of("backlash", {"gap": 0.003}) == 0.003 and in_words("backlash", 0.003) == "0.17 deg"
+    assert in_words("backlash", 0.003, slide=True) == "3.0 mm" and in_words("actuator_delay", 0.004) == "4.0 ms"
+    assert amount_of("actuator_gain", {"gain": 0.7}) == pytest.approx(0.3) and in_words("actuator_gain", 0.3) == "30 %"
+    assert in_words("actuator_saturation", 0.5) == "2.0 N m" and unit_of("viscous_friction", False) == "N m s/rad"
     assert unit_of("armature", False) == "kg m²" and unit_of("joint_elasticity", True) == "m/N"
 
 

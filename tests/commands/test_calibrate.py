@@ -13,7 +13,7 @@ from bayessim_mjx.inference import calibration
 from bayessim_mjx.inference.calibration import Ranks
 from bayessim_mjx.inference.checks import Checks
 from bayessim_mjx.inference.misspecification import Misfit
-from bayessim_mjx.inference.sets import Count, Sets
+from bayessim_mjx.inference.product_calibration import Count, Sets
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.writer import event_files, records
 from bayessim_mjx.parameters import Parameter, ParameterSpace

@@ -6,10 +6,10 @@ import pytest
 from scipy import stats
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import importance, near, sets
-from bayessim_mjx.inference.pareto import generalised_pareto
+from bayessim_mjx.inference import importance, local_recalibration, product_calibration
+from bayessim_mjx.inference.final_importance_sampling import generalised_pareto
+from bayessim_mjx.inference.mixture_fit import Mixture
 from bayessim_mjx.inference.temperature import tempered
-from bayessim_mjx.inference.weighted import Mixture
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter(name, 0.0, -1.0, 1.0) for name in "ab"])
@@ -25,7 +25,7 @@ def test_a_set_is_judged_with_the_widening_that_the_other_half_asks_for() -> Non
     count = 40
     thetas = np.zeros((count, 2))
     thetas[::2, 0] = 4 * SD * 2  # theta is twice as wide as the unit cube
-    found = sets.counted(1, sets.stacked([at()] * count), thetas)
+    found = product_calibration.counted(1, product_calibration.stacked([at()] * count), thetas)
     # even sets with the factor 1 of the odd ones: 1 - exp(-4^2 / 2) of a Gaussian in two dimensions
     np.testing.assert_allclose(found.levels[::2], 1 - np.exp(-8.0), atol=2e-3)
     assert found.levels[1::2].max() < 0.01
@@ -42,7 +42,7 @@ def test_a_mean_error_is_drawn_to_zero_by_what_chance_adds() -> None:
     """16 errors of mean 1 and variance 1: the mean's square is 1/16 more than the truth's on average."""
     off = np.tile([-1.0, 1.0], 8)[:, None]
     off = 1.0 + off / off.std(ddof=1)
-    move, cov = near.mean_error(off)
+    move, cov = local_recalibration.mean_error(off)
     np.testing.assert_allclose(move, [1 - 1 / 16], rtol=1e-9)
     np.testing.assert_allclose(cov, [[1.0]], rtol=1e-9)
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import ndtri
 
 from bayessim_mjx.distributions import charts
-from bayessim_mjx.inference import coverage_factor
+from bayessim_mjx.inference import temperature
 
 N, D = 400, 2
 MASK = jnp.ones(N)
@@ -23,7 +23,7 @@ def posteriors(factor, spread=0.05):
 
 @jax.jit
 def found_factor(z, mask):
-    return coverage_factor.factor(jax.random.PRNGKey(0), posteriors, z, mask, EVERY, "plain")
+    return temperature.coverage_factor(jax.random.PRNGKey(0), posteriors, z, mask, EVERY, "plain")
 
 
 def truths(spread):
@@ -34,14 +34,18 @@ def truths(spread):
 @pytest.mark.slow
 @pytest.mark.ci
 def test_levels_of_exact_posteriors_are_uniform():
-    found = np.asarray(coverage_factor.levels(jax.random.PRNGKey(0), posteriors(1.0), truths(0.05), EVERY, "plain"))
+    found = np.asarray(
+        temperature.coverage_levels(jax.random.PRNGKey(0), posteriors(1.0), truths(0.05), EVERY, "plain")
+    )
     # Kolmogorov-Smirnov: 1.63 / sqrt(n) is exceeded by chance in 1 %
     assert np.max(np.abs(np.sort(found) - (np.arange(N) + 0.5) / N)) < 1.63 / N**0.5
 
 
 @pytest.mark.slow
 def test_the_level_of_a_gaussian_is_the_chi_square_probability():
-    found = np.asarray(coverage_factor.levels(jax.random.PRNGKey(0), posteriors(1.0), truths(0.05), EVERY, "plain"))
+    found = np.asarray(
+        temperature.coverage_levels(jax.random.PRNGKey(0), posteriors(1.0), truths(0.05), EVERY, "plain")
+    )
     distance = np.sum(np.asarray(truths(0.05) - posteriors(1.0)[1][:, 0]) ** 2, axis=1) / 0.05**2
     expected = 1 - np.exp(-distance / 2)  # chi-square with two degrees of freedom
     assert np.mean(np.abs(found - expected)) < 0.05  # 64 draws: .04 on average
@@ -53,7 +57,9 @@ def test_a_region_of_half_the_mass_holds_half_the_truths():
     z = 0.5 + 0.05 * jnp.asarray(ndtri((np.arange(n) + 0.5) / n), jnp.float32)
     mixtures = jnp.zeros((n, 1)), jnp.full((n, 1, 1), 0.5), jnp.full((n, 1, 1, 1), 0.05)
     found = np.asarray(
-        jax.jit(lambda k: coverage_factor.levels(k, mixtures, z[:, None], EVERY[:1], "plain"))(jax.random.PRNGKey(3))
+        jax.jit(lambda k: temperature.coverage_levels(k, mixtures, z[:, None], EVERY[:1], "plain"))(
+            jax.random.PRNGKey(3)
+        )
     )
     for region in (0.2, 0.5, 0.8):  # standard error below .002, the truths being even
         assert np.mean(found <= region) == pytest.approx(region, abs=0.005)
@@ -66,7 +72,7 @@ def test_draws_outside_the_box_are_not_the_posteriors():
     z = z[np.all((z > 0) & (z < 1), axis=1)][:N]
     scales = jnp.broadcast_to(0.7 * jnp.eye(D), (N, 1, D, D))
     mixtures = jnp.zeros((N, 1)), jnp.full((N, 1, D), 0.5), scales
-    found = coverage_factor.levels(jax.random.PRNGKey(0), mixtures, jnp.asarray(z, jnp.float32), EVERY, "plain")
+    found = temperature.coverage_levels(jax.random.PRNGKey(0), mixtures, jnp.asarray(z, jnp.float32), EVERY, "plain")
     assert abs(float(jnp.mean(found)) - 0.5) < 0.05  # 3 / sqrt(12 N) = .043, and draws
 
 
@@ -101,5 +107,5 @@ def test_parameters_at_the_prior_do_not_hide_what_is_too_wide():
         return logits, jnp.pad(means, ((0, 0), (0, 0), (0, others)), constant_values=0.5), scales + flat
 
     z = jnp.concatenate([truths(0.05 / wide), more], axis=1)
-    found = coverage_factor.factor(jax.random.PRNGKey(0), beside, z, MASK, keep, "plain")
+    found = temperature.coverage_factor(jax.random.PRNGKey(0), beside, z, MASK, keep, "plain")
     assert float(found) == pytest.approx(wide, rel=0.1)

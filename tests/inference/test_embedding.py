@@ -11,7 +11,7 @@ from scipy.special import ndtr
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import InferenceSettings, condition, fit, init
-from bayessim_mjx.inference.embedding import Embedding
+from bayessim_mjx.inference.summaries.learned import Embedding
 from bayessim_mjx.inference.summarizers import summary_learned
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 

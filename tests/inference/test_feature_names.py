@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from bayessim_mjx.inference import feature_names, summarizers
-from bayessim_mjx.inference.embedding import Embedding
+from bayessim_mjx.inference import summarizers
+from bayessim_mjx.inference.summaries.learned import Embedding
 
 STATES, ACTIONS, STEPS = ("angle", "speed"), ("torque",), 4
 
@@ -26,7 +26,7 @@ STATES, ACTIONS, STEPS = ("angle", "speed"), ("torque",), 4
     ],
 )
 def test_there_is_one_for_each(summary):
-    names = feature_names.names(summary, STEPS, STATES, ACTIONS)
+    names = summarizers.feature_names(summary, STEPS, STATES, ACTIONS)
     assert len(names) == summarizers.size(summarizers.get(summary), STEPS, len(STATES), len(ACTIONS))
     assert len(set(names)) == len(names)
 
@@ -38,7 +38,7 @@ def test_only_what_a_name_speaks_of_enters_the_feature(summary):
     key_s, key_a = jax.random.split(jax.random.PRNGKey(0))
     states, actions = jax.random.normal(key_s, (STEPS + 1, 2)), jax.random.normal(key_a, (STEPS, 1))
     of_states, of_actions = jax.jit(jax.jacobian(summarize, argnums=(0, 1)))(states, actions)
-    for i, name in enumerate(feature_names.names(summary, STEPS, STATES, ACTIONS)):
+    for i, name in enumerate(summarizers.feature_names(summary, STEPS, STATES, ACTIONS)):
         for channel, slope in (("angle", of_states[i, :, 0]), ("speed", of_states[i, :, 1]), ("torque", of_actions[i])):
             assert (channel in name) == bool(jnp.any(jnp.abs(slope) > 1e-6)), (name, channel)
         if " at step " in name and "change" not in name:
@@ -48,9 +48,9 @@ def test_only_what_a_name_speaks_of_enters_the_feature(summary):
 
 
 def test_lags_are_told_apart():
-    names = feature_names.names("corr_1", STEPS, STATES, ACTIONS)
+    names = summarizers.feature_names("corr_1", STEPS, STATES, ACTIONS)
     assert names[:4] == tuple(f"corr({s}, torque) lag {lag}" for lag in (0, 1) for s in STATES)
-    assert feature_names.names("corr", STEPS, STATES, ACTIONS)[0] == "corr(angle, torque)"
+    assert summarizers.feature_names("corr", STEPS, STATES, ACTIONS)[0] == "corr(angle, torque)"
     summarize = summarizers.get("corr_1")
     states = jnp.zeros((STEPS + 1, 2)).at[2, 0].set(1.0)
     actions = jnp.zeros((STEPS, 1)).at[1, 0].set(1.0)  # the state one step later
@@ -58,5 +58,5 @@ def test_lags_are_told_apart():
 
 
 def test_the_learned_embedding_takes_rows_of_that_many():
-    names = feature_names.names("learned", STEPS, STATES, ACTIONS)
+    names = summarizers.feature_names("learned", STEPS, STATES, ACTIONS)
     assert len(names) == Embedding(STEPS, len(STATES), len(ACTIONS), window=3).row_size

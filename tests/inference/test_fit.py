@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.inference import InferenceSettings, combine, condition, fit, infer, init, mdn
-from bayessim_mjx.inference.data import Again, Data
 from bayessim_mjx.inference.ensemble import weigh
+from bayessim_mjx.inference.state import Again, Data
 from bayessim_mjx.inference.train import _Member
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 

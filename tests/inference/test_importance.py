@@ -8,11 +8,16 @@ import pytest
 from scipy.stats import genpareto, norm
 
 from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.inference.final_importance_sampling import (
+    UNRELIABLE,
+    final_importance_sampling,
+    generalised_pareto,
+    smoothed,
+)
 from bayessim_mjx.inference.importance import Refined, refine, sharpened
-from bayessim_mjx.inference.independent import independent
-from bayessim_mjx.inference.pareto import UNRELIABLE, effective, generalised_pareto, smoothed
-from bayessim_mjx.inference.weighted import Mixture
-from bayessim_mjx.loop.refinement import Refinement
+from bayessim_mjx.inference.mixture_fit import Mixture
+from bayessim_mjx.inference.smc import ess_of
+from bayessim_mjx.loop.likelihood_refinement import Refinement
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter(name, 0.0, -1.0, 1.0) for name in "abc"])
@@ -93,7 +98,7 @@ def test_weights_are_smoothed_by_the_tail_that_they_have():
     weights, tail = smoothed(rng.normal(size=4000))
     assert weights.sum() == pytest.approx(1.0) and tail < 0.5
     assert smoothed(6 * rng.normal(size=4000))[1] > 0.7
-    assert effective(np.full(50, 1 / 50)) == pytest.approx(50)
+    assert ess_of(np.full(50, 1 / 50)) == pytest.approx(50)
 
 
 def test_where_few_draws_are_possible_the_next_are_drawn_among_them():
@@ -192,9 +197,10 @@ def test_independent_draws_bring_the_regions_nearer_to_what_they_say():
 def test_the_tail_of_the_weights_is_kept_and_warned_of(wide, fits):
     """Draws from Gaussians as wide as the posterior, and a sixth of it: then few draws have all the weight."""
     own = Mixture(np.ones(1), np.full((1, 2), 0.5), (0.02 * np.eye(2))[None] ** 2)
-    found = independent(np.random.default_rng(0), own, lambda u: -0.5 * (((u - 0.5) / (0.02 * wide)) ** 2).sum(1), 256)
+    rng = np.random.default_rng(0)
+    found = final_importance_sampling(rng, own, lambda u: -0.5 * (((u - 0.5) / (0.02 * wide)) ** 2).sum(1), 256)
     assert (found.shape < UNRELIABLE) is fits
-    refined = Refined(None, None, None, found.worth, 4096, np.zeros(2), None, found.shape)
+    refined = Refined(None, None, None, found.ess, 4096, np.zeros(2), None, found.shape)
     refinement = Refinement(refined, None, 1.0)
     assert (refinement.warning() is None) is fits and refinement.to_dict()["pareto_k"] == found.shape
     assert fits or f"k = {found.shape:.2g}" in refinement.warning()

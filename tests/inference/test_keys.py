@@ -8,8 +8,8 @@ import numpy as np
 
 from bayessim_mjx.inference.densities import mdnn
 from bayessim_mjx.inference.settings import InferenceSettings
-from bayessim_mjx.inference.train import APART, _Member
-from bayessim_mjx.keys import branch
+from bayessim_mjx.inference.train import _Member
+from bayessim_mjx.keys import GOLDEN, branch
 
 KEY = jax.random.PRNGKey(3)
 
@@ -30,7 +30,7 @@ def test_units_are_dropped_by_other_keys_in_every_layer_step_and_point_of_the_cu
     monkeypatch.setattr(mdnn.jax.nn, "silu", lambda x: x)
     params = {"layers": [{"w": jnp.ones((2, 2)), "b": jnp.zeros(2)}] * 4}
     for i in range(-2, points):  # the trials of bases come before 0
-        _, _, keys = _Member.batches(member, KEY + jnp.asarray(i, jnp.int32).astype(KEY.dtype) * APART, chunk)
+        _, _, keys = _Member.batches(member, KEY + jnp.asarray(i, jnp.int32).astype(KEY.dtype) * GOLDEN, chunk)
         for key in keys:
             mdnn._hidden(params, jnp.ones((4, 2)), (key, jnp.float32(0.1)))
     assert len({tuple(key.tolist()) for key in used}) == len(used) == (points + 2) * chunk * 3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import InferenceSettings, fit, gaussians, infer, init
+from bayessim_mjx.inference import InferenceSettings, fit, infer, init, mdn
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 FLAT = ParameterSpace([Parameter("a", 0.0, -1.0, 1.0), Parameter("b", 0.0, -1.0, 1.0)])
@@ -64,7 +64,7 @@ def test_the_slope_of_a_gaussian_is_the_closed_one():
     v, root = rng.normal(size=(6, 4)), rng.normal(size=(6, 4, 4)) * np.asarray([1, 1, 10, 1000])[:, None]
     cov = root @ np.swapaxes(root, 1, 2) + np.eye(4)
     a, inverse = np.linalg.solve(cov, v[..., None])[..., 0], np.linalg.inv(cov)
-    found = jax.grad(lambda v, c: jnp.sum(gaussians.log_gaussian(v, c)), (0, 1))(
+    found = jax.grad(lambda v, c: jnp.sum(mdn.log_gaussian(v, c)), (0, 1))(
         jnp.asarray(v, jnp.float32), jnp.asarray(cov, jnp.float32)
     )
     np.testing.assert_allclose(found[0], -a, atol=1e-3)

@@ -12,10 +12,9 @@ import pytest
 from bayessim_mjx.config import BayesSimConfig
 from bayessim_mjx.config.names import DENSITIES, SUMMARIES
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference import InferenceSettings, densities, feature_names, fit, infer, init, mdn, summaries
-from bayessim_mjx.inference.streaming import stream
-from bayessim_mjx.inference.summarizers import get, size
-from bayessim_mjx.loop.collection import Seen
+from bayessim_mjx.inference import InferenceSettings, densities, fit, infer, init, mdn, summaries
+from bayessim_mjx.inference.summarizers import feature_names, get, size, stream
+from bayessim_mjx.loop.collection import SummaryInputs
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 PAGE = Path(__file__).parents[2] / "docs" / "own_summary.md"
@@ -58,7 +57,7 @@ def test_the_summary_of_the_how_to(page):
     ended = get("energy_2")(STATES, ACTIONS, jnp.asarray([1.0, 0.0, 0.0]))  # it stands still from the second state on
     np.testing.assert_allclose(ended, [0.5, 1.0, 1.0, 1.0])
     assert size(get("energy_3"), 20, 4, 2) == 12
-    seen = Seen(3, ("angle", "speed"), ("torque",))
+    seen = SummaryInputs(3, ("angle", "speed"), ("torque",))
     assert seen.features("energy") == ("mean square of angle, part 1", "mean square of speed, part 1")
     assert seen.embedding("energy") is None
     with pytest.raises(UserError, match="summary_energy has no streaming form; corr, corrdiff"):
@@ -67,7 +66,7 @@ def test_the_summary_of_the_how_to(page):
 
 def test_what_a_summary_does_not_say_is_numbered_and_what_it_says_wrongly_is_told():
     summaries.register(summaries.Summary("summary_last", lambda states, actions, valid=None: states[-1]))
-    assert feature_names.names("last", 3, ("a", "b"), ("c",)) == ("last 1", "last 2")
+    assert feature_names("last", 3, ("a", "b"), ("c",)) == ("last 1", "last 2")
     with pytest.raises(UserError, match="bayessim.summarizerFxn = 'summary_last_2': summary_last takes no number"):
         BayesSimConfig(summarizerFxn="last_2")
     wrong = {
@@ -78,7 +77,7 @@ def test_what_a_summary_does_not_say_is_numbered_and_what_it_says_wrongly_is_tol
     for function, names, words in wrong.values():
         summaries.register(summaries.Summary("summary_bad", function, names=names))
         with pytest.raises(UserError, match=words):
-            feature_names.names("bad", 3, ("a", "b"), ("c",))
+            feature_names("bad", 3, ("a", "b"), ("c",))
 
 
 def test_names_that_are_taken_or_none_are_refused():

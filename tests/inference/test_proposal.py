@@ -9,7 +9,7 @@ import pytest
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import InferenceSettings, init, mdn
-from bayessim_mjx.inference.proposal import draw_truncated, proposal_of, sequential, stack
+from bayessim_mjx.inference.rounds import draw_truncated, proposal_of, sequential, stack
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 NORMAL = ParameterSpace([Parameter(n, 0.0, -3.0, 3.0, prior="gaussian", mean=0.0, sd=0.5) for n in ("a", "b")])

@@ -7,7 +7,7 @@ import pytest
 
 from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import InferenceSettings, region, set_network
+from bayessim_mjx.inference import InferenceSettings, set_network
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter(name, 0.0, -1.0, 1.0) for name in "ab"])
@@ -20,7 +20,7 @@ def near(mean, sd, space=SPACE, chart="plain"):
 
 
 def test_draws_fill_the_ellipsoid_around_a_posterior():
-    y, mean, scale = region.draw(KEY, near([0.4, 0.6], [0.02, 0.01]), 4000)
+    y, mean, scale = set_network.draw_region(KEY, near([0.4, 0.6], [0.02, 0.01]), 4000)
     assert np.allclose(mean, [0.4, 0.6], atol=2e-3) and float(jnp.linalg.norm(y, axis=1).max()) <= 1.0
     # of a ball that is filled evenly in two dimensions the variance is 1 / 4 each
     assert np.allclose(np.cov(np.asarray(y).T), np.eye(2) / 4, atol=0.02)
@@ -30,16 +30,16 @@ def test_draws_fill_the_ellipsoid_around_a_posterior():
 
 def test_draws_stay_in_the_ranges_and_are_even_there():
     q = near([0.5, 0.05], [2.0, 0.02])  # nothing is known of the first; the second is at its end
-    y, mean, scale = region.draw(KEY, q, 4000)
+    y, mean, scale = set_network.draw_region(KEY, q, 4000)
     u = np.asarray(mean + y @ scale.T)
     assert u.min() >= -1e-5 and u.max() <= 1 + 1e-5
     assert u[:, 0].mean() == pytest.approx(0.5, abs=0.03) and u[:, 0].var() == pytest.approx(1 / 12, rel=0.1)
-    theta = np.asarray(region.theta(q, jnp.asarray(u)))
+    theta = np.asarray(set_network.theta_at(q, jnp.asarray(u)))
     assert np.allclose(theta, 2 * u - 1, atol=1e-5)
 
 
 def test_draws_are_those_of_a_gaussian_prior():
-    y, mean, scale = region.draw(KEY, near([0.5, 0.0], [0.9, 0.1], NORMAL, "probit"), 4000)
+    y, mean, scale = set_network.draw_region(KEY, near([0.5, 0.0], [0.9, 0.1], NORMAL, "probit"), 4000)
     z = np.asarray(mean + y @ scale.T)
     # the first has hardly been narrowed: all of its prior
     assert z[:, 0].mean() == pytest.approx(0.0, abs=0.08) and z[:, 0].std() == pytest.approx(1.0, abs=0.06)

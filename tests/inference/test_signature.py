@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayessim_mjx.inference import signature as sig
+from bayessim_mjx.inference.summaries import signatures as sig
 
 pytestmark = pytest.mark.usefixtures("strict")
 

@@ -9,7 +9,7 @@ from bayessim_mjx.config.names import SUMMARIES
 from bayessim_mjx.config.settings import BayesSimConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import summarizers
-from bayessim_mjx.inference.streaming import stream
+from bayessim_mjx.inference.summarizers import stream
 
 STATES = jnp.asarray([[0.0, 1.0], [1.0, 1.0], [3.0, 0.0], [6.0, 0.0]])  # T = 3, S = 2
 ACTIONS = jnp.asarray([[1.0], [2.0], [-1.0]])

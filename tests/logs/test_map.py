@@ -8,8 +8,8 @@ import pytest
 from log_files import FREE, GOOD_MAP, refused, rows, write
 
 from bayessim_mjx.logs import Channels, Log, read_logs, resample, segments
+from bayessim_mjx.logs.csv_files import read_csv
 from bayessim_mjx.logs.mapping import Source
-from bayessim_mjx.logs.table import read_csv
 
 WHOLE = {"ctrl": {"m_shoulder": 1, "m_elbow": 2}, "qpos": {"shoulder": 3, "elbow": 4}}
 

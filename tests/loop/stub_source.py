@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx import config, loop
-from bayessim_mjx.loop import round_inference, sources
+from bayessim_mjx.loop import outer_loop, round_inference, sources
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("mass", 0.0, -1.0, 1.0), Parameter("unseen", 0.0, -1.0, 1.0)])
@@ -33,7 +33,7 @@ class Stub:
     env: None = None  # no robot that programs are compiled for
     noisy: bool = False  # no other draws of noise are asked for
     truth: np.ndarray = dataclasses.field(default_factory=lambda: TRUTH)
-    channels: sources.Seen = sources.Seen(1, ("height",), ("push",))
+    channels: sources.SummaryInputs = sources.SummaryInputs(1, ("height",), ("push",))
 
     def simulate(self, key, thetas, policy):
         noise = jax.random.normal(key, (len(thetas), 2))
@@ -52,7 +52,7 @@ def made(*more: str, space: ParameterSpace = SPACE, **source) -> tuple[loop.Loop
     settings = config.load("Pendulum", overrides=[*SMALL, *more])
     names = ("mean of height", "push at step 0")
     parts = loop.Loop(types.SimpleNamespace(space=space), settings, Stub(**source), 2, names)
-    return parts, loop.LoopState(round=jnp.int32(0), train=None, **round_inference.blank(parts))
+    return parts, loop.LoopState(round=jnp.int32(0), train=None, **outer_loop.blank(parts))
 
 
 def infer(parts: loop.Loop, state: loop.LoopState) -> tuple[loop.LoopState, loop.RoundInfo]:

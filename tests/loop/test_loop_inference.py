@@ -134,7 +134,7 @@ def test_products_of_several_trajectories_are_judged_and_widened():
     assert len(again.at(4).levels) == len(again.near[0].levels) == 128 and not again.off
     assert not np.array_equal(again.at(4).levels[:64], last.levels)  # on sets that the round did not see
     told = again.to_dict()
-    assert told["sets"] == 128 and told["carried"] == again.carried and len(told["near"]) == 1
+    assert told["sets"] == 128 and told["carried"] == again.saturates_at and len(told["near"]) == 1
 
 
 def test_a_single_trajectory_needs_no_set():

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.kalman import innovations, measured_noise, riccati
-from bayessim_mjx.loop import refining
-from bayessim_mjx.loop.likelihood import Likelihood
+from bayessim_mjx.loop import trajectories
+from bayessim_mjx.loop.likelihood import Likelihood, repeated, silent
 from bayessim_mjx.loop.state import LoopState
-from bayessim_mjx.loop.travel import repeated, silent
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.tangent import difference, noisy
@@ -92,7 +91,7 @@ def test_one_channel_with_more_noise_than_was_told_leaves_the_others_theirs(phys
     assert not found.noise.process.any()
     assert found.least == 1.0  # none of the others may become better than was told
     np.testing.assert_array_equal(
-        found.begun.qpos, found.starts.begun(told).qpos
+        found.shrunk.qpos, found.starts.shrunk(told).qpos
     )  # the noise of starts is the told one
 
 
@@ -112,7 +111,7 @@ def test_a_joint_that_shows_one_value_has_no_say_unless_its_noise_is_told(physic
     assert found.silent.tolist() == [False, True, False, True] and found.seen.tolist() == [True, False, True, False]
     assert found.scale.min() > 1e-4  # states that are not seen are varied by numbers that float32 can tell apart
     known = Likelihood(physics, held, np.ones((COUNT, STEPS)), np.array([0.02, 0.001, 0.05, 0.01]))
-    assert known.seen.all() and known.told[1] == pytest.approx(0.001)
+    assert known.seen.all() and known.stated[1] == pytest.approx(0.001)
 
 
 def test_a_sensor_without_noise_that_moves_keeps_its_say(physics):
@@ -144,7 +143,7 @@ def test_a_surrogates_orientations_are_as_noisy_as_is_said_and_of_norm_one():
         jnp.float32,
     )
     state = types.SimpleNamespace
-    blank = refining.no_motion(
+    blank = trajectories.no_motion(
         loop := state(
             source=state(noise=sd), settings=state(trainTrajLen=rows - 1, realTrajs=1),
             env=state(physics=state(mj_model=FREE)), key=lambda *_: jax.random.key(3),
@@ -154,7 +153,7 @@ def test_a_surrogates_orientations_are_as_noisy_as_is_said_and_of_norm_one():
         qpos=qpos, qvel=jnp.zeros((1, rows, 6)), command=jnp.zeros((1, rows - 1, 0)), valid=jnp.ones((1, rows - 1))
     )
     empty = dict.fromkeys(f.name for f in dataclasses.fields(LoopState))
-    kept = refining.stored(loop, LoopState(**empty | {"round": 0, "motion": blank}), real).motion
+    kept = trajectories.stored(loop, LoopState(**empty | {"round": 0, "motion": blank}), real).motion
     np.testing.assert_allclose(np.linalg.norm(kept["qpos"][0, :, 3:], axis=-1), 1.0, atol=1e-5)
     away = np.asarray(jax.vmap(lambda a, b: difference(FREE, a, b))(kept["qpos"][0], qpos[0]))
     np.testing.assert_allclose(away.std(0), sd, rtol=0.12)  # sd of an sd of 400: 3.5 %

@@ -8,10 +8,10 @@ import pytest
 
 from bayessim_mjx import config
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference.sets import stacked
-from bayessim_mjx.loop import outer_loop, round_inference
+from bayessim_mjx.inference.product_calibration import stacked
+from bayessim_mjx.loop import outer_loop, posterior
 from bayessim_mjx.loop.likelihood import Likelihood
-from bayessim_mjx.loop.refinement import _spread
+from bayessim_mjx.loop.likelihood_refinement import _spread
 from bayessim_mjx.loop.state import Evidence, joined
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
@@ -62,13 +62,13 @@ def test_a_rounds_own_trajectories_are_judged_by_its_own_network(monkeypatch: py
     def four(middle: float) -> Distribution:
         return stacked([Distribution.from_unit(space, np.zeros(1), [[middle]], [[[0.05]]])] * 4)
 
-    monkeypatch.setattr(round_inference, "conditioned", lambda *_: four(0.6))
-    monkeypatch.setattr(round_inference, "kept", lambda factors, *_: factors)
+    monkeypatch.setattr(posterior, "conditioned", lambda *_: four(0.6))
+    monkeypatch.setattr(posterior, "kept", lambda factors, *_: factors)
     settings = config.load("Pendulum", overrides=["bayessim.realTrajs=2"]).bayessim
     parts = SimpleNamespace(settings=settings, source=SimpleNamespace(policy_dependent=True))
     fit = SimpleNamespace(identified=None)
     state = SimpleNamespace(round=1, fit=fit, real_features=None, temperature=1.0, real_posteriors=four(0.3))
-    found, warnings = round_inference._factors(parts, state)
+    found, warnings = posterior._factors(parts, state)
     assert not warnings
     np.testing.assert_allclose(found.means[:, 0, 0], [0.3, 0.3, 0.6, 0.6], rtol=1e-6)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.loop.likelihood import Likelihood
-from bayessim_mjx.loop.starts import Starts
+from bayessim_mjx.loop.noise import Starts
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.rollout import replay
@@ -40,7 +40,7 @@ def test_the_share_of_noise_by_hand():
     starts = Starts(record(np.array([[0.0], [2.0], [4.0], [2.0]]), np.zeros((4, 1))), MODEL)
     # squares about the mean: 4 + 0 + 4 + 0; one start more than tells nothing: 1 * .5^2 / 8
     np.testing.assert_allclose(starts.share(np.array([0.5, 0.5])), [0.03125, 1.0])
-    np.testing.assert_allclose(states(starts.begun(np.array([0.5, 0.5])))[:, 0], [0.0625, 2.0, 3.9375, 2.0])
+    np.testing.assert_allclose(states(starts.shrunk(np.array([0.5, 0.5])))[:, 0], [0.0625, 2.0, 3.9375, 2.0])
     # Morris: 1 - B (N - 1) / N, and 2 B / N for B that is estimated
     np.testing.assert_allclose(
         starts.sd(np.array([0.5, np.inf]))[0], 0.5 * np.sqrt(1 - 0.03125 * 3 / 4 + 2 * 0.03125 / 4)
@@ -53,7 +53,7 @@ def test_starts_are_known_as_well_as_is_said(spread):
     for seed in range(200):
         true, seen = measured(spread, 16, seed)
         starts = Starts(seen, MODEL)
-        errors.append(states(starts.begun(np.full(2, NOISE))) - true)
+        errors.append(states(starts.shrunk(np.full(2, NOISE))) - true)
         told.append(starts.sd(np.full(2, NOISE)))
     error, said = np.sqrt(np.mean(np.square(errors))), np.sqrt(np.mean(np.square(told)))
     best = NOISE * spread / np.hypot(NOISE, spread)
@@ -64,7 +64,7 @@ def test_starts_are_known_as_well_as_is_said(spread):
 def test_what_is_left_unknown_of_a_start_has_nothing_to_do_with_where_it_is():
     """Else it would pass for damping. As measured the two go together by the variance of the noise."""
     true, seen = measured(0.2, 20_000)
-    here, error = states(Starts(seen, MODEL).begun(np.full(2, NOISE))), states(seen) - true
+    here, error = states(Starts(seen, MODEL).shrunk(np.full(2, NOISE))), states(seen) - true
     as_measured = np.mean(error * (states(seen) - states(seen).mean(0)), axis=0)
     np.testing.assert_allclose(as_measured, NOISE**2, rtol=0.1)
     np.testing.assert_allclose(np.mean((here - true) * (here - here.mean(0)), axis=0), 0, atol=5e-4)
@@ -72,12 +72,12 @@ def test_what_is_left_unknown_of_a_start_has_nothing_to_do_with_where_it_is():
 
 def test_few_starts_and_channels_that_are_not_measured_stay_as_they_are():
     few = measured(0.1, 3)[1]
-    np.testing.assert_array_equal(states(Starts(few, MODEL).begun(np.full(2, 9.0))), states(few))
+    np.testing.assert_array_equal(states(Starts(few, MODEL).shrunk(np.full(2, 9.0))), states(few))
     np.testing.assert_array_equal(Starts(few, MODEL).sd(np.full(2, 9.0)), 9.0)
     many = measured(0.1, 30)[1]
-    begun = states(Starts(many, MODEL).begun(np.array([NOISE, np.inf])))
-    np.testing.assert_array_equal(begun[:, 1], states(many)[:, 1])
-    assert (begun[:, 0] != states(many)[:, 0]).all()
+    shrunk = states(Starts(many, MODEL).shrunk(np.array([NOISE, np.inf])))
+    np.testing.assert_array_equal(shrunk[:, 1], states(many)[:, 1])
+    assert (shrunk[:, 0] != states(many)[:, 0]).all()
 
 
 def test_rotations_are_drawn_along_their_tangents():
@@ -86,9 +86,9 @@ def test_rotations_are_drawn_along_their_tangents():
     qpos = np.concatenate([np.arange(18.0).reshape(6, 3), quats], axis=1)
     sensor = np.concatenate([np.full(3, 1e-6), np.full(3, 1e3), np.full(6, np.inf)])
     starts = Starts(record(qpos, np.zeros((6, 6))), mujoco.MjModel.from_xml_string(FREE))
-    begun = np.asarray(starts.begun(sensor).qpos[:, 0])
-    np.testing.assert_allclose(begun[:, :3], qpos[:, :3], atol=1e-6)
-    np.testing.assert_allclose(begun[:, 3:], [[1, 0, 0, 0]] * 6, atol=2e-3)  # all noise: everyone has the mean
+    shrunk = np.asarray(starts.shrunk(sensor).qpos[:, 0])
+    np.testing.assert_allclose(shrunk[:, :3], qpos[:, :3], atol=1e-6)
+    np.testing.assert_allclose(shrunk[:, 3:], [[1, 0, 0, 0]] * 6, atol=2e-3)  # all noise: everyone has the mean
 
 
 @pytest.mark.slow

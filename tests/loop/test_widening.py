@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bayessim_mjx.loop.refinement import _grouped, _shrunk
+from bayessim_mjx.loop.likelihood_refinement import _grouped, _shrunk
 
 
 def sampled(rng, sd, count):

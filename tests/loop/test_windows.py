@@ -12,7 +12,7 @@ import pytest
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Channels, Log, noise, write_log
-from bayessim_mjx.loop import refining
+from bayessim_mjx.loop import likelihood_refinement
 from bayessim_mjx.loop.recorded import apart, recorded
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
@@ -89,7 +89,7 @@ def test_overlapping_segments_are_simulated_and_count_once(env, tmp_path):
     assert len(dense.pool) == 13 and dense.supply == plain.supply == 4
     each = []
     for parts in (loop, other):
-        likelihood = refining._likelihood(parts, types.SimpleNamespace(motion=None), 4)
+        likelihood = likelihood_refinement._likelihood(parts, types.SimpleNamespace(motion=None), 4)
         assert likelihood.count == 2 * ROWS  # every measured row once
         likelihood.settle(theta)
         each.append(np.sqrt(np.diag(likelihood.laplace[1])))
@@ -111,7 +111,7 @@ def test_posteriors_of_overlapping_segments_are_as_sure_as_they_may_be(env, tmp_
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             _, loop = source_of(env, tmp_path, [log], stride=15)
-        likelihood = refining._likelihood(loop, types.SimpleNamespace(motion=None), 4)
+        likelihood = likelihood_refinement._likelihood(loop, types.SimpleNamespace(motion=None), 4)
         likelihood.settle(theta)
         mean, cov = likelihood.laplace
         z.append((mean - likelihood._z(theta)) / np.sqrt(np.diag(cov)))
@@ -123,7 +123,7 @@ def test_a_late_velocity_is_no_measurement_of_the_loop(env, tmp_path):
     logs = [log_of(env, k, sd=0.005, late=1)[0] for k in range(2)]
     with pytest.warns(UserWarning, match=r"real.logs: qvel:x is .* \+(4|5)\d ms late.*positions are used instead"):
         source, loop = source_of(env, tmp_path, logs)
-    likelihood = refining._likelihood(loop, types.SimpleNamespace(motion=None), 4)
+    likelihood = likelihood_refinement._likelihood(loop, types.SimpleNamespace(motion=None), 4)
     assert likelihood.seen.tolist() == [True, False]
     assert not any(name == "deviation of x speed" for name in source.channels.states)
     index = source.order[:2]

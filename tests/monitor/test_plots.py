@@ -264,7 +264,7 @@ def test_all_that_a_calibration_picture_says_is_inside_of_it(d):
 
 
 def test_a_calibration_picture_shows_posteriors_of_several_trajectories():
-    from bayessim_mjx.inference.sets import Count, Sets
+    from bayessim_mjx.inference.product_calibration import Count, Sets
     from bayessim_mjx.monitor import trust
 
     even = (np.arange(64) + 0.5) / 64

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import config, loop
-from bayessim_mjx.inference.sets import Count, Sets
+from bayessim_mjx.inference.product_calibration import Count, Sets
 from bayessim_mjx.monitor import session, video
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.film import Motion

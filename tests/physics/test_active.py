@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.fitting.centred_commands import Centred
+from bayessim_mjx.diagnosis.fitting.simulator import Centred
 from bayessim_mjx.effects import load
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Drive, Physics, control_step

@@ -14,7 +14,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Task
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import summarizers
-from bayessim_mjx.loop import simulations
+from bayessim_mjx.loop import trajectories
 from bayessim_mjx.loop.sources import Surrogate
 from bayessim_mjx.physics.warp import OVERFLOW, refuse_overflow
 from bayessim_mjx.wrappers.gymnasium import GymnasiumVectorEnv
@@ -93,7 +93,7 @@ def collected(env):
     one = np.ones(1), nominal[None], 0 * nominal[None]
     source = Surrogate(env, env.space, *one, "policy_random", 3, 0.0, summarizers.get("start"))
     prior = Distribution.prior(env.space, 1)
-    _, x, _ = simulations.simulated(source, jax.random.PRNGKey(0), policy(env), prior, "prior", WORLDS)
+    _, x, _ = trajectories.simulated(source, jax.random.PRNGKey(0), policy(env), prior, "prior", WORLDS)
     return float(np.isfinite(x).all())
 
 

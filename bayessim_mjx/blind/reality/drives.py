@@ -98,9 +98,9 @@ class AccelerationLimit(ActuatorCause):
 
     def follow(self, command: float, seconds: float) -> None:
         """Towards a command for some seconds."""
-        told = self.parameters()
-        top = 1 / told["slowness"] if told["slowness"] else math.inf
-        way, self.rate = quickest(command - self.value, self.rate, top, 1 / told["inertness"], seconds)
+        own = self.parameters()
+        top = 1 / own["slowness"] if own["slowness"] else math.inf
+        way, self.rate = quickest(command - self.value, self.rate, top, 1 / own["inertness"], seconds)
         self.value += way
 
     def parameters(self) -> dict[str, float]:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-# a choice of what experimenters do; the benchmark of benchmarks/results.md has the same
+# a choice of what experimenters do; the cases of benchmarks/diagnosis have the same
 SECONDS = 4.0
 RISE = 0.25  # s, of a step, so that a step asks for an effort that drives have
 # (operating condition, profile, amplitude and pace as multiples of the system's)

@@ -47,15 +47,13 @@ class Ruler:
         scale = np.array(list(base.values()))
         self.bounds = (np.minimum(1 - spread - scale, -1e-9), np.maximum(1 + spread - scale, 1e-9))
 
-    def windows(
-        self, plant: Plant, runs: Sequence[Run], shift: Sequence[np.ndarray] | None = None, every: int = 1
-    ) -> np.ndarray:
-        """Simulated positions less recorded ones, `[windows, rows, n]`, in noises; of every so many windows."""
+    def windows(self, plant: Plant, runs: Sequence[Run], shift: Sequence[np.ndarray] | None = None) -> np.ndarray:
+        """Simulated positions less recorded ones, `[windows, rows, n]`, in noises."""
         dq, dv = shift or (0.0, 0.0)
         out = []
         starts = [(r, start) for r in runs for start in range(0, len(r.time) - self.rows, self.rows)]
         thin = max(1, len(starts) // MOST)
-        for r, start in starts[::thin][::every]:
+        for r, start in starts[::thin]:
             plant.reset(r.clean[start] + dq, r.clean_v[start] + dv, r.ctrl[start])
             plant.resume(r, start)
             for k in range(start, start + self.rows):
@@ -63,9 +61,9 @@ class Ruler:
                 out.append(plant.measure()[0] - r.clean[k + 1])
         return np.array(out).reshape(-1, self.rows, len(self.system.sigma)) / np.asarray(self.system.sigma)
 
-    def outside(self, x: np.ndarray, every: int = 1) -> np.ndarray:
+    def outside(self, x: np.ndarray) -> np.ndarray:
         """Columns `[windows, rows, joints, ...]` without the part that initial states explain, flattened."""
-        flat, free = x.reshape(*x.shape[:1], self.rows * x.shape[2], -1), self.free[::every]
+        flat, free = x.reshape(*x.shape[:1], self.rows * x.shape[2], -1), self.free
         return (flat - free @ (np.swapaxes(free, 1, 2) @ flat)).reshape(-1, flat.shape[-1])
 
     def measure(self, runs: Sequence[Run]) -> tuple[float, float]:

@@ -155,7 +155,7 @@ def closed(ruler: Ruler, truth: Plant, corrected: Plant) -> float | None:
 
 def base_of(parameters: Mapping[str, Mapping[str, float]], names: Sequence[str]) -> dict[str, float]:
     """Factors of the known parameters in a diagnosis.json, 1 where it does not tell one; {} where it tells none."""
-    told = {n: parameters.get(n.rpartition(".")[0] + "_" + n.rpartition(".")[2] + "_mult") for n in names}
-    if not any(told.values()):
+    given = {n: parameters.get(n.rpartition(".")[0] + "_" + n.rpartition(".")[2] + "_mult") for n in names}
+    if not any(given.values()):
         return {}
-    return {n: float(v["mean"]) / float(v.get("nominal", 1.0) or 1.0) if v else 1.0 for n, v in told.items()}
+    return {n: float(v["mean"]) / float(v.get("nominal", 1.0) or 1.0) if v else 1.0 for n, v in given.items()}

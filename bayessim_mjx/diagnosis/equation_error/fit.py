@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.equation_error.sums import BUDGET, Sums
+from bayessim_mjx.diagnosis.equation_error.sums import Sums
+from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST
 from bayessim_mjx.diagnosis.statistics import times
 
 Array = NDArray[np.float64]
@@ -20,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How a fit is made."""
+    """How a fit is made. Choices; that six rounds settle and a hundredth is the filters' error was not counted."""
 
     floor: float = 0.01  # of a joint's root mean square effort
     rounds: int = 6  # of a fit, in which variances, scales and places of loads settle
@@ -105,7 +106,7 @@ def _spans(terms: Sequence[Term]) -> list[slice]:
 def used(sums: Sums) -> NDArray[np.bool_]:
     """`[nv]`: joints whose effort is known and that moved."""
     known = np.array([s != "" for s in sums.source])
-    return known & (sums.rows.sum(0) > BUDGET.least) & (sums.size > 0)
+    return known & (sums.rows.sum(0) >= FEWEST) & (sums.size > 0)
 
 
 def left(sums: Sums, gram: Array, model: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Which effects the efforts call for: added one by one as long as parts of the data that were held out gain by it."""
+"""Which effects the efforts call for, one by one while held-out parts of the data gain; and what they contradict."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from bayessim_mjx.diagnosis.data_sheet import DRIVES
 from bayessim_mjx.diagnosis.equation_error import fit as fitting
 from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
+from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel
+from bayessim_mjx.quantities import percent
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Criteria:
-    """When an effect is proposed. The error rates are those of benchmarks/results.md (diagnosis: before any
-    simulation).
+    """When an effect is proposed. Error rates: benchmarks/records/first_look.json.
 
     Attributes:
         nats: held-out log density that an effect has to bring, beside the logarithm of the number of effects tried.
@@ -28,6 +29,8 @@ class Criteria:
         looked: effects that are held out in each round, the best of all in sample.
         most: effects proposed at most; at several joints an effect is one.
         same: nats by which another effect may be behind to be told as well, and its share of the effect's own gain.
+        tied: nats that one value everywhere loses against values at some places, so that it is contradicted.
+        apart: by which the scales of two drives differ that have not one gain.
     """
 
     nats: float = 10.0
@@ -37,11 +40,17 @@ class Criteria:
     most: int = 4
     same: float = 5.0
     share: float = 0.1
+    tied: float = 20.0
+    apart: float = 0.05
 
 
 CRITERIA = Criteria()
 ALONE = ("payload",)  # effects of bodies: a robot carries one load
 GAIN = "actuator_gain"
+# frictions are not among them: 1 of 16 that were the same everywhere would have been lost
+TIED = (GAIN,)
+# what would make a drive's effort another function of its command than a scale and a constant
+OF_DRIVES = ("actuator_deadband", "actuator_saturation", "rate_limit", "speed_torque_limit", "effort_loss")
 
 
 Move = tuple[Term, ...]  # what is added in one step: a term, or one effect at all of its places
@@ -219,3 +228,44 @@ def _deviations(term: Term, values: Array, covariance: Array) -> dict[str, float
         for k, x in term.read(moved).items():
             slopes[k][i] = (x - mean[k]) / step
     return {k: max(float(s @ covariance @ s), 0.0) ** 0.5 for k, s in slopes.items()}
+
+
+def contradicted(
+    sums: Sums, known: Sequence[Term], offered: Sequence[Term], found: Found, channels: Sequence[Channel]
+) -> dict[str, str]:
+    """{label of a candidate: why}."""
+    out = {f"{effect}@all": why for effect in TIED if (why := _elsewhere(sums, known, offered, found, effect))}
+    if why := _unlike(channels):
+        out["actuator_gain@all"] = why
+    sound = {c.actuator: c for c in channels if c.static and c.sound}
+    for effect in OF_DRIVES:
+        for name, c in sound.items():
+            out[f"{effect}@{name}"] = f"{name}'s effort follows its command but for {percent(c.left)}"
+        if sound:
+            out[f"{effect}@all"] = f"{next(iter(sound))}'s effort follows its command"
+    return out
+
+
+def _elsewhere(sums: Sums, known: Sequence[Term], offered: Sequence[Term], found: Found, effect: str) -> str:
+    """Why an effect is not the same everywhere: at some places alone it explains far more; or nothing."""
+    own = [p for p in found.proposals if p.term.effect == effect and p.term.where != "all"]
+    tied = [t for t in offered if (t.effect, t.where) == (effect, "all")]
+    if not own or not tied:
+        return ""
+    others = [p.term for p in found.proposals if p not in own]
+    density = float(fitting.score(sums, [*known, *others, *tied]).sum())
+    if found.density[1] - density < CRITERIA.tied:
+        return ""
+    values = [f"{next(iter(p.parameters.values())):.2g} at {p.term.where}" for p in own]
+    return f"{' and '.join(values)}, and not elsewhere"
+
+
+def _unlike(channels: Sequence[Channel]) -> str:
+    """Two drives whose efforts are different shares of what was commanded; or nothing."""
+    told = sorted((c for c in channels if c.told and not c.echo), key=lambda c: c.scale)
+    if len(told) < 2 or all(c.off == 1.0 for c in told):
+        return ""
+    low, high = told[0], told[-1]
+    if high.scale - low.scale < CRITERIA.apart + 3.0 * (low.deviation + high.deviation):
+        return ""
+    return f"{low.scale:.2g} of the command at {low.actuator}, {high.scale:.2g} at {high.actuator}"

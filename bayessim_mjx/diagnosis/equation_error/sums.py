@@ -1,4 +1,4 @@
-"""All logs as sums of products: everything after one pass over the data is algebra on small matrices."""
+"""All logs as sums of products of columns and efforts: what follows is algebra on small matrices."""
 
 from __future__ import annotations
 
@@ -11,24 +11,73 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.equation_error.columns import LIMITS, Layout, columns, layout_of, sources
+from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
+from bayessim_mjx.diagnosis.logcheck.regressor import SLOW, Mask, Motion, Regressor, filtered, motion
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
+OWN = ("acceleration", "speed", "dry", "drag", "position", "one", "load", "effort_load")
+SHIFT = 1e-4  # rad or m, for the derivative by a joint's zero: exact to rounding, which costs 1e-12 of it
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How much is looked at, and in how many parts logs are held out."""
+    """How much is looked at, and in how many parts logs are held out: seconds, not errors. Choices, not counted."""
 
     rows: int = 12000  # of all logs together, at their own rates
     folds: int = 3  # with fewer logs, each is cut into parts
     parts: int = 4
     most: int = 12  # parts of all logs together: those of more logs are held out side by side
-    least: float = 6.0  # independent rows of a joint in a part
+    many: int = 16  # dofs, beyond which zeros of joints are not looked at
 
 
 BUDGET = Budget()
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the columns stand: ten of each body, the joint's own (OWN), zeros [nv], drives, tilt, late, known, effort.
+
+    shared: actuators that drive a joint together with others; each has a column of its own effort.
+    """
+
+    bodies: int
+    nv: int
+    shared: tuple[int, ...] = ()
+
+    @property
+    def size(self) -> int:
+        return rigid_body.INERTIAL * self.bodies + len(OWN) + self.nv + len(self.shared) + 5
+
+    def body(self, i: int) -> slice:
+        return slice(rigid_body.INERTIAL * i, rigid_body.INERTIAL * (i + 1))
+
+    def own(self, name: str) -> int:
+        return rigid_body.INERTIAL * self.bodies + OWN.index(name)
+
+    def zero(self, dof: int) -> int:
+        return rigid_body.INERTIAL * self.bodies + len(OWN) + dof
+
+    def drive(self, actuator: int) -> int:
+        """Of one of the actuators `shared`."""
+        return rigid_body.INERTIAL * self.bodies + len(OWN) + self.nv + self.shared.index(actuator)
+
+    @property
+    def tilt(self) -> slice:
+        return slice(self.size - 5, self.size - 3)
+
+    @property
+    def late(self) -> int:
+        return self.size - 3
+
+    @property
+    def known(self) -> int:
+        """What the nominal model says."""
+        return self.size - 2
+
+    @property
+    def effort(self) -> int:
+        return self.size - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +85,7 @@ class Sums:
     """Products of the columns, `gram` `[F, nv, P, P]` by parts, each row counted as so many independent ones.
 
     Attributes:
-        rows: `[F, nv]`, independent rows; source: `[nv]`, where the effort comes from (`columns.sources`).
+        rows: `[F, nv]`, independent rows; source: `[nv]`, where the effort comes from (`sources`).
         period: s between the logs' rows.
     """
 
@@ -62,6 +111,88 @@ class Sums:
         return np.sqrt(np.max([self.power(c) for c in (lay.effort, lay.known, lay.own("load"))], axis=0))
 
 
+def sources(log: Log, model: mujoco.MjModel) -> tuple[str, ...]:
+    """Per dof: `effort` as measured, `ctrl` as commanded, `none` where nothing drives it, `` where it is not known."""
+    dofs = [drives.dof_of(model, i) for i in range(model.nu)]
+    elsewhere = any(d is None for d in dofs)
+    out = []
+    for dof in range(model.nv):
+        own = [i for i, d in enumerate(dofs) if d == dof]
+        if not own:
+            out.append("" if elsewhere else "none")
+        elif all(drives.measured(log, i) is not None for i in own):
+            out.append("effort")
+        else:
+            out.append("ctrl" if all(_known(model, i) for i in own) else "")
+    return tuple(out)
+
+
+def _known(model: mujoco.MjModel, i: int) -> bool:
+    """Whether the actuator's force is a static law of command, position and speed."""
+    fixed = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+    affine = int(model.actuator_biastype[i]) <= int(mujoco.mjtBias.mjBIAS_AFFINE)
+    return fixed and affine and int(model.actuator_dyntype[i]) == int(mujoco.mjtDyn.mjDYN_NONE)
+
+
+def layout_of(model: mujoco.MjModel) -> Layout:
+    """The columns of a model."""
+    dofs = [drives.dof_of(model, i) for i in range(model.nu)]
+    shared = tuple(i for i, dof in enumerate(dofs) if dof is not None and dofs.count(dof) > 1)
+    return Layout(len(rigid_body.moving_bodies(model)), model.nv, shared)
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """One log: x `[T, nv, size]`, rows `[nv, T]` to be used, and how many independent ones a row is."""
+
+    x: Array
+    rows: Mask
+    share: float
+
+
+def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Array) -> Columns:
+    """All columns of one log.
+
+    Args:
+        source: `[nv]`, see `sources`; slow: `[nv]`, speeds at which dry friction turns over.
+    """
+    moved, layout = motion(log, model), layout_of(model)
+    found = Regressor.of(model, moved, slow)
+    x = np.zeros((len(moved.time), model.nv, layout.size))
+    x[:, :, : layout.own(OWN[0])] = found.columns
+    x[:, :, layout.tilt], x[:, :, layout.known] = found.tilt, found.known
+    of = {"effort": drives.measured_forces(log, model), "ctrl": drives.commanded(drives.centred(log), model)}
+    each = {name: drives.on_dofs(force, model) for name, force in of.items()}
+    effort = np.where(np.array(source) == "effort", each["effort"], each["ctrl"])
+    y = np.stack([filtered(effort[:, v], log, moved) for v in range(model.nv)], 1)
+    for name, column in found.own.items():
+        x[:, :, layout.own(name)] = column
+    x[:, :, layout.own("effort_load")] = moved.smooth(np.abs(y) * found.dry)
+    if model.nv <= BUDGET.many:
+        for v, column in _zeros(model, moved).items():
+            x[:, :, layout.zero(v)] = moved.smooth(column)
+    x[:, :, layout.effort], x[:, :, layout.late] = y, np.gradient(y, moved.step, axis=0)
+    for i in layout.shared:
+        dof = drives.dof_of(model, i)
+        if dof is not None and source[dof] in of:
+            x[:, dof, layout.drive(i)] = filtered(model.actuator_gear[i, 0] * of[source[dof]][:, i], log, moved)
+    rows = np.stack([moved.moving(v) & (source[v] != "") for v in range(model.nv)])
+    return Columns(x, rows, moved.share)
+
+
+def _zeros(model: mujoco.MjModel, moved: Motion) -> dict[int, Array]:
+    """{dof: `[T, nv]`}, derivative of the nominal effort by the zero of a hinge or slide."""
+    out = {}
+    for joint in np.flatnonzero(model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)):
+        ends = []
+        for sign in (1, -1):
+            qpos = moved.qpos.copy()
+            qpos[:, int(model.jnt_qposadr[joint])] += sign * SHIFT
+            ends.append(rigid_body.recursive(model, qpos, moved.qvel, moved.qacc))
+        out[int(model.jnt_dofadr[joint])] = (ends[0] - ends[1]) / (2 * SHIFT)
+    return out
+
+
 def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
     """The sums of logs that move; joints whose effort is not known in all of them are left out."""
     each = [sources(log, model) for log in logs]
@@ -72,7 +203,7 @@ def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
     grams, rows = [], []
     parts = BUDGET.parts if len(short) < BUDGET.folds else 1
     for log in short:
-        own = columns(log, model, source, LIMITS.slow * top + 1e-12)
+        own = columns(log, model, source, SLOW * top + 1e-12)
         for part in np.array_split(np.arange(own.rows.shape[1]), parts):
             gram = np.zeros((model.nv, layout.size, layout.size))
             count = np.zeros(model.nv)

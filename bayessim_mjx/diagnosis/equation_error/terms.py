@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY
-from bayessim_mjx.diagnosis.equation_error import rigid
-from bayessim_mjx.diagnosis.equation_error.columns import Layout
 from bayessim_mjx.diagnosis.equation_error.fit import Term
-from bayessim_mjx.diagnosis.logcheck import loads
+from bayessim_mjx.diagnosis.equation_error.sums import Layout
+from bayessim_mjx.diagnosis.logcheck import loads, rigid_body
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of
+from bayessim_mjx.diagnosis.logcheck.regressor import TILT
 from bayessim_mjx.effects.support.site import element_names
 
 Array = NDArray[np.float64]
+Reader = Callable[[Array], Mapping[str, float]]  # coefficients -> parameters of the effect
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,6 @@ class Ranges:
     sure: float = 0.2  # standard deviation of a gain's inverse
     zero: float = 0.05  # rad, standard deviation of a joint's zero and of a base's tilt
     share: float = 1.0  # of the load that dry friction may be
-    tilt: float = 0.3  # rad
     late: float = 3.0  # periods: standard deviation of how late efforts are
 
 
@@ -50,9 +50,9 @@ def known(
             data sheet's.
         period: s between the logs' rows.
     """
-    nominal = rigid.nominal(model)
+    nominal = rigid_body.nominal(model)
     out = []
-    for i, body in enumerate(rigid.moving_bodies(model)):
+    for i, body in enumerate(rigid_body.moving_bodies(model)):
         column = np.zeros(layout.size)
         column[layout.body(i)] = nominal[i]
         if nominal[i, 0] > 0:
@@ -103,7 +103,7 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
     out += _on_actuators(model, layout, driven)
     tilt = np.stack([_everywhere(layout, c) for c in range(layout.tilt.start, layout.tilt.stop)], -1)
     if np.any(model.opt.gravity):
-        ends = -RANGES.tilt, RANGES.tilt
+        ends = -TILT, TILT
         out.append(_wide("gravity_tilt", "world", tilt, *ends, _reader("roll", "pitch"), sd=RANGES.zero))
     return [*out, *payloads(model, layout, carried), *links(model, layout)]
 
@@ -163,9 +163,9 @@ def links(model: mujoco.MjModel, layout: Layout) -> list[Term]:
             continue
         shape, own = np.zeros((layout.nv, layout.size, 4)), layout.body(base)
         for k, axis in enumerate(turn.T):
-            ends = [rigid.inertial(mass, centre + sign * axis, none) for sign in (1, -1)]
+            ends = [rigid_body.inertial(mass, centre + sign * axis, none) for sign in (1, -1)]
             shape[:, own, k] = (ends[0] - ends[1]) / 2  # exact: it is quadratic
-        shape[:, own, 3] = rigid.inertial(0.0, centre, axes @ np.diag(model.body_inertia[body]) @ axes.T)
+        shape[:, own, 3] = rigid_body.inertial(0.0, centre, axes @ np.diag(model.body_inertia[body]) @ axes.T)
         sd = np.array([*(q.deviation * loads.size(model, body) for q in places), inertia.deviation])
         name = element_names(model, "body")[body]
         out.append(_wide("inertial_parameters", name, shape, -np.inf, np.inf, _link, sd=sd))
@@ -177,7 +177,7 @@ def _placed(model: mujoco.MjModel) -> Iterator[tuple[int, int, Array, Array, Arr
 
     Its centre of mass `[3]` and both axes `[3, 3]` are in the axes of that moving body, from its origin.
     """
-    bodies, data = rigid.moving_bodies(model), mujoco.MjData(model)
+    bodies, data = rigid_body.moving_bodies(model), mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     for body in range(1, model.nbody):
@@ -200,7 +200,7 @@ def _load(layout: Layout, body: int, centre: Array, turn: Array) -> Callable[[Ar
     steps = np.eye(3)
 
     def point(place: Array) -> Array:
-        return rigid.inertial(1.0, centre + turn @ place, np.zeros((3, 3)))
+        return rigid_body.inertial(1.0, centre + turn @ place, np.zeros((3, 3)))
 
     def shape(last: Array) -> Array:
         place = _place(last)
@@ -241,7 +241,7 @@ def _spring(c: Array) -> Mapping[str, float]:
     return {"stiffness": k, "cubic": 0.0, "rest": -float(c[1]) / k}
 
 
-def _reader(*parameters: str, sign: float = 1.0) -> Callable[[Array], Mapping[str, float]]:
+def _reader(*parameters: str, sign: float = 1.0) -> Reader:
     return lambda c: {n: sign * float(x) for n, x in zip(parameters, c, strict=True)}
 
 
@@ -263,10 +263,11 @@ def _everywhere(layout: Layout, column: int) -> Array:
     return out
 
 
-def _fixed(effect: str, where: str, column: Array, low: float = -np.inf, sd: float = np.inf, **more: object) -> Term:
+def _fixed(
+    effect: str, where: str, column: Array, low: float = -np.inf, sd: float = np.inf, read: Reader = lambda c: {}
+) -> Term:
     """A term of one coefficient and one map `[nv, P]`."""
-    believed = np.array([sd])
-    return Term(effect, where, lambda c: column[:, :, None], low=np.array([low]), sd=lambda c: believed, **more)  # type: ignore[arg-type]
+    return _wide(effect, where, column[:, :, None], low, np.inf, read, sd)
 
 
 def _wide(
@@ -275,11 +276,10 @@ def _wide(
     maps: Array,
     low: float | Array,
     high: float | Array,
-    read: object,
+    read: Reader,
     sd: float | Array = np.inf,
 ) -> Term:
     """A term of several coefficients and maps `[nv, P, k]`."""
     k = maps.shape[-1]
-    ends = np.broadcast_to(low, (k,)).astype(float), np.broadcast_to(high, (k,)).astype(float)
-    believed = np.broadcast_to(sd, (k,)).astype(float)
-    return Term(effect, where, lambda c: maps, k, sd=lambda c: believed, low=ends[0], high=ends[1], read=read)  # type: ignore[arg-type]
+    least, most, believed = (np.broadcast_to(x, (k,)).astype(float) for x in (low, high, sd))
+    return Term(effect, where, lambda c: maps, k, sd=lambda c: believed, low=least, high=most, read=read)

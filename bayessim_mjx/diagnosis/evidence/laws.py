@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from bayessim_mjx.diagnosis.equation_error.rigid import inertial
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.effects import load, names
 from bayessim_mjx.parameters import geometry

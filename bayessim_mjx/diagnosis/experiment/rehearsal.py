@@ -14,8 +14,8 @@ from flax import struct
 from numpy.typing import NDArray
 
 from bayessim_mjx.compat import compiler_options
+from bayessim_mjx.diagnosis.experiment.drives import Drives, drives_of
 from bayessim_mjx.diagnosis.experiment.excitation import Excitation, Limits, middle
-from bayessim_mjx.diagnosis.logcheck.drives import Drives, drives_of
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Drive, Physics, control_step

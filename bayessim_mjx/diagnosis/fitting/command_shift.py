@@ -16,16 +16,17 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import SPAN
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
-from bayessim_mjx.diagnosis.fitting.substeps import Case, Errors
+from bayessim_mjx.diagnosis.fitting.substep_errors import Case, Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
+from bayessim_mjx.diagnosis.logcheck.timing import SURE, Late
 
 Array = NDArray[np.float64]
-Late = Callable[[float], Windows]  # s -> the windows with commands that act so much later
+Shifted = Callable[[float], Windows]  # s -> the windows with commands that act so much later
 
 
 @dataclass(frozen=True)
 class Rules:
-    """How a shift is estimated, and when it is told."""
+    """How a shift is estimated, and when it is told. Chosen on the shifts of its tests; error rates not counted."""
 
     rounds: int = 3  # Newton steps with the first one's derivatives
     nudge: float = 0.1  # control steps, of the shift for its finite difference
@@ -37,7 +38,6 @@ class Rules:
     furthest: float = 0.02  # s, or three control steps
     direction: float = 0.1  # of the typical speed, at which friction has turned round
     least_late: tuple[float, float] = (0.05, 0.0001)  # control steps and s: what a simulator's own step may be worth
-    sure: float = 4.0  # standard errors, by windows
     explains: float = 0.75  # of the cost above the noise: what else is missing would leave more
     seen: float = 0.02  # of the noise's own cost
     alike: float = 0.4  # of the shift, by which that of a condition may differ
@@ -67,10 +67,15 @@ class Shift:
     step: float
 
     @property
+    def behind(self) -> Late:
+        """Commands behind their rows (`Timing.commands`)."""
+        return Late(self.late, self.error)
+
+    @property
     def certain(self) -> bool:
         """Whether nothing else that is known would do as well."""
         steps, least = RULES.least_late
-        told = abs(self.late) > max(RULES.sure * self.error, steps * self.step, least) and self.seen > RULES.seen
+        told = abs(self.late) > max(SURE * self.error, steps * self.step, least) and self.seen > RULES.seen
         return told and self.explains > RULES.explains and self.apart < RULES.alike
 
     @property
@@ -106,7 +111,7 @@ class Shift:
         return f"{text}{smooth} (`commands_late: {self.late:.4g}` beside the logs does the same)"
 
 
-def estimate(errors: Errors, late: Late, sigma: Array, force: Array, factor: int) -> Shift | None:
+def estimate(errors: Errors, late: Shifted, sigma: Array, force: Array, factor: int) -> Shift | None:
     """The shift of all commands together; None: the fit finds no end.
 
     Args:
@@ -141,7 +146,7 @@ def estimate(errors: Errors, late: Late, sigma: Array, force: Array, factor: int
 class _Model:
     """Whitened residuals `[W, n]` as a function of (shift, parameters, gains, forces)."""
 
-    def __init__(self, errors: Errors, late: Late, sigma: Array, force: Array, factor: int) -> None:
+    def __init__(self, errors: Errors, late: Shifted, sigma: Array, force: Array, factor: int) -> None:
         self.errors, self.late, self.sigma, self.factor = errors, late, sigma, factor
         space = errors.physics.space
         self.low, self.high = (np.array([getattr(p, end) for p in space.parameters]) for end in ("low", "high"))

@@ -16,7 +16,7 @@ from bayessim_mjx.physics import Physics
 
 @dataclass(frozen=True)
 class Cutting:
-    """How logs are cut into windows, and how many are simulated."""
+    """How logs are cut into windows, and how many are simulated. Choices between seconds and accuracy, not counted."""
 
     window: float = 0.5  # s
     # of it, tried in turn while the time step with contacts is worth more than `lottery` noises

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.fitting import quadratic
 from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.fitting.substeps import Errors, held
+from bayessim_mjx.diagnosis.fitting.substep_errors import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
 from bayessim_mjx.logs.log import Channels, Log
@@ -28,7 +29,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How fine a time step is looked for, and when its error is known."""
+    """How fine a time step is looked for, and when its error is known. Rules of thumb, not counted."""
 
     factors: tuple[int, ...] = (1, 2, 4, 8)
     more: tuple[int, ...] = (16, 32)  # beyond the budget, where the step is worth more than the tolerance
@@ -40,7 +41,6 @@ class Rules:
     # errors that shrink by less from one sub-step to its half are not worth finer ones
     converging: float = 1.3
     sure: float = 0.4  # of what is taken for noise: below, the estimates themselves are too coarse
-    far: float = 4.0  # medians: windows with larger errors are no measure, as in the fit
 
 
 RULES = Rules()
@@ -203,8 +203,8 @@ def measure(
     start = cuts(first)
     touching = contacts(physics)
     sigma = np.concatenate([start.sigma_q, start.sigma_v])
-    like = cheaper is not None and cheaper.cut.alike(start)
-    errors = Errors(physics, start, 4 * first, cheaper if like else None)
+    parts = [(own.log.tolist(), own.start.tolist(), own.steps) for own in (start, cheaper.cut if cheaper else start)]
+    errors = Errors(physics, start, 4 * first, cheaper if parts[0] == parts[1] else None)
     errors.start(sigma)
     coarse, mid, fine = (errors.run(cuts(first * f), first * f) for f in (1, 2, 4))
     plain = errors.run(held(start), first, corrected=False)
@@ -275,7 +275,7 @@ def _size(error: Array, touching: bool) -> Array:
     """Root mean square `[channels]` of errors `[W, H, channels]`; windows far off count less, with contacts hardly."""
     each = np.mean(error**2, axis=1)
     usual = np.median(each, axis=0)
-    return np.asarray(np.sqrt(usual if touching else np.mean(np.minimum(each, RULES.far**2 * usual), axis=0)))
+    return np.asarray(np.sqrt(usual if touching else np.mean(np.minimum(each, quadratic.RULES.far**2 * usual), axis=0)))
 
 
 def contacts(physics: Physics) -> bool:

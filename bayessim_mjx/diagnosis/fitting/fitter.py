@@ -22,9 +22,8 @@ from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 
 __all__ = ["Fit", "Fitter", "weights"]
 Array = NDArray[np.float64]
-START_STEP = 0.2  # of the spread of the start states, for their finite differences
 # Of the largest curvature by ranges, by which each number is damped. Of 0, .003, .01, .03, .1, .3 and 1, from four far
-# starts of a payload and a bias, 2, 2, 4, 2, 3, 4 and 3 arrive; 1 finds no limit beside play (benchmarks/results.md)
+# starts of a payload and a bias, 2, 2, 4, 2, 3, 4 and 3 arrive; 1 finds no limit beside play (3240de4)
 DAMPED = 0.01
 NUMBERS = 2  # independent ones that one channel of one window holds: a missing force shows as a smooth curve
 
@@ -77,7 +76,7 @@ class Fitter:
     def start_columns(self, theta: Array, offsets: Array, r: Array) -> Array:
         """B `[W, n, s]` at theta."""
         s = offsets.shape[1]
-        h = START_STEP * self.spread
+        h = quadratic.START_STEP * self.spread
         moved = offsets[None] + (np.eye(s) * h)[:, None, :]
         shifted = self.whiten(self.simulator.run(np.repeat(theta[None], s, 0), moved))
         return np.ascontiguousarray(np.moveaxis((r[None] - shifted) / h[:, None, None], 0, -1))

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.fitting.stepper import Stepper
+from bayessim_mjx.diagnosis.fitting.reference_stepper import Stepper
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 

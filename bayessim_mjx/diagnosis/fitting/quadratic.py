@@ -21,16 +21,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How conditions are held out where one alone tells a parameter."""
+    """How conditions are held out that alone tell a parameter, and windows weighed. Rules of thumb, not counted."""
 
     parts: int = 8
     # a parameter whose variance grows by this without a condition is told by that condition alone
     only: float = 9.0
     # of the curvature: without a condition the fit stays put along directions that no data decide
     trust: float = 0.001
+    far: float = 4.0  # medians, beyond which a window counts less
 
 
 RULES = Rules()
+START_STEP = 0.2  # of the spread of the start states, for their finite differences; a choice, not counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +268,7 @@ def _variances(S: Array) -> Array:
 def weights(r: Array) -> Array:
     """Huber weights of whole windows: those far worse than the rest (a stop, a stick phase, a push) count less."""
     each = np.sqrt(np.mean(r**2, 1))
-    limit = 4.0 * np.median(each) + 1e-12
+    limit = RULES.far * np.median(each) + 1e-12
     return np.minimum(1.0, limit / np.maximum(each, 1e-300))
 
 

@@ -47,7 +47,7 @@ class Robot:
         max_qvel: the task's limit of simulated speeds, see `Physics`.
         accuracy: {parameter: standard deviation as a share}, of what a data sheet states; rating: {body: kg carried}.
         assumed: those of them whose accuracy nobody stated.
-        unlimited: joints whose limits its physics leaves out; rounds: iterations of its solver, at most (`lean`).
+        unlimited: joints whose limits its physics leaves out; rounds: most iterations of its solver (`pruned_model`).
     """
 
     mj_model: mujoco.MjModel

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Limits:
-    """How large effects may be, from what the logs show."""
+    """How large effects may be, from what the logs show. Rules of thumb, not counted."""
 
     large: float = 98.0  # percentile that counts as the largest
     load: float = 3.0  # times its own mass that a body may carry at least

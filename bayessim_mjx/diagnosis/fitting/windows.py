@@ -12,8 +12,7 @@ import numpy as np
 from flax import struct
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.fitting.operating import group_notes, groups_of
-from bayessim_mjx.diagnosis.fitting.sensors import noise_of
+from bayessim_mjx.diagnosis.logcheck.noise import noise_of
 from bayessim_mjx.effects.support.motion import AROUND, Motion
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.commands import means
@@ -97,11 +96,6 @@ class Windows:
         """`[W]`, share of the rows compared that were measured; what lies between two rows of a log tells no more."""
         return np.minimum(1.0, self.dt / np.array(self.periods)[self.log])
 
-    def alike(self, other: Windows) -> bool:
-        """Whether these are the same parts of the logs."""
-        parts = [(own.log.tolist(), own.start.tolist(), own.steps) for own in (self, other)]
-        return parts[0] == parts[1]
-
 
 def cut(
     logs: Sequence[Log],
@@ -138,10 +132,8 @@ def cut(
         raise UserError(
             f"no log holds {length} control steps of {dt:.4g} s; the longest has {longest}; allowed: longer logs"
         )
-    if blocks := len(names) == 1:  # one condition only: blocks in time are held out
-        names, group_of_window = _blocks(starts, even)
-    else:
-        group_of_window = [group_of[r] for r, _ in starts]
+    blocks = len(names) == 1  # one condition only: blocks in time are held out
+    names, group_of_window = _blocks(starts, even) if blocks else (names, [group_of[r] for r, _ in starts])
     sigma_q, sigma_v, spread = noise_of(even, logs, use_qvel and all(log.has_qvel for log in logs))
     return Windows(
         batch=_batch(even, fine, starts, length, dt, model, controllers.of_logs(logs, model)),
@@ -196,9 +188,8 @@ def _starts(logs: Sequence[Log], length: int, limit: int, past: int | None) -> l
     every = []
     for r, log in enumerate(logs):
         last = len(log) - 1 - length
-        if last < 0:
-            continue
-        every += [(r, 0)] if past is None else [(r, a) for a in range(min(past, last % length), last + 1, length)]
+        if last >= 0:
+            every += [(r, 0)] if past is None else [(r, a) for a in range(min(past, last % length), last + 1, length)]
     if len(every) <= limit:
         return every
     keep = np.unique(np.linspace(0, len(every) - 1, limit).round().astype(int))
@@ -259,3 +250,51 @@ def _enabled(even: Sequence[Log], starts: list[tuple[int, int]], length: int, mo
 
 def _stack(parts: list) -> jax.Array:
     return jnp.asarray(np.stack(parts).astype(np.float32))  # by numpy: each cast of a new shape is a program
+
+
+def groups_of(logs: Sequence[Log], key: str | None = None) -> tuple[list[int], tuple[str, ...]]:
+    """Operating condition of each log: metadata `key`, else `condition` or `operating_condition`, else one per log.
+
+    Pieces of one file that was cut at its gaps are one log.
+
+    Raises:
+        UserError: the key that was asked for is in no log's metadata.
+    """
+    labels = _labels(logs, key)
+    if key and not any(labels):
+        have = ", ".join(sorted({k for log in logs for k in log.metadata})) or "no keys"
+        raise UserError(f"--group {key}: no log's metadata has this key; there are: {have}")
+    told = len(set(labels)) > 1  # the same condition everywhere cannot be held out
+    labels = [label if label and told else file for label, file in zip(labels, _files(logs), strict=True)]
+    names = tuple(dict.fromkeys(labels))
+    return [names.index(label) for label in labels], names
+
+
+def _files(logs: Sequence[Log]) -> list[str]:
+    """Each log's name; of pieces of one file that of the file."""
+    sources = [str(log.metadata.get("source", log.name)) for log in logs]
+    names = [(log.name.rpartition("#")[0], log.name) for log in logs]
+    return [file if file and sources.count(of) > 1 else log for (file, log), of in zip(names, sources, strict=True)]
+
+
+def _labels(logs: Sequence[Log], key: str | None) -> list[str]:
+    """Each log's condition, "" where its metadata do not tell."""
+    found = [
+        log.metadata.get(key) if key else log.metadata.get("condition", log.metadata.get("operating_condition"))
+        for log in logs
+    ]
+    return ["" if value is None else str(value) for value in found]
+
+
+def group_notes(logs: Sequence[Log], key: str | None) -> tuple[str, ...]:
+    """What is held out in place of the conditions that were asked for, where these cannot be."""
+    labels = _labels(logs, key)
+    if not key or not any(labels):
+        return ()
+    without = [log.name for log, label in zip(logs, labels, strict=True) if not label]
+    if without:
+        return (f"--group {key}: {', '.join(without)} without this key: each is held out as a condition of its own",)
+    if len(set(labels)) > 1:
+        return ()
+    instead = "single logs" if len(set(_files(logs))) > 1 else "blocks of the only log in time"
+    return (f"--group {key}: {labels[0]!r} in all logs, so nothing can be held out by it; {instead} are held out",)

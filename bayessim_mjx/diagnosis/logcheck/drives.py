@@ -1,89 +1,18 @@
-"""How actuators are commanded: torque, position or velocity, in which units, and gains to close a loop."""
+"""Actuators and joints: how each is commanded, and the force that it should exert for a command, or did."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
-import jax
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from bayessim_mjx.logs.log import Channels
+from bayessim_mjx.logs.log import Array, Log
+from bayessim_mjx.physics import controllers
 
-Array = NDArray[np.float64]
-BANDWIDTH = 12.0  # rad/s, of the loop around a torque-driven joint
-KINDS = ("torque", "position", "velocity", "none")
 _JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _NO_MEMORY = tuple(int(getattr(mujoco.mjtDyn, f"mjDYN_{n}")) for n in ("NONE", "FILTER", "FILTEREXACT"))
-
-
-@dataclass(frozen=True, eq=False)
-class Drives:
-    """How each actuator is commanded: u = unit * target, or for torque unit * (feed-forward + kp e + kd de/dt).
-
-    Attributes:
-        kind: `[nu]`, one of KINDS; joint: `[nu]` names ("" where it drives no hinge or slide).
-        q, v: `[nu]`, columns in qpos and qvel; unit: `[nu]`, ctrl per joint unit; kp, kd: `[nu]`, in ctrl units.
-    """
-
-    kind: tuple[str, ...]
-    joint: tuple[str, ...]
-    q: NDArray[np.int64]
-    v: NDArray[np.int64]
-    unit: Array
-    kp: Array
-    kd: Array
-
-    def joints(self) -> dict[str, int]:
-        """{joint: dof} that can be moved."""
-        return {n: int(v) for n, v, kind in zip(self.joint, self.v, self.kind, strict=True) if n and kind != "none"}
-
-
-def drives_of(model: mujoco.MjModel, law: Any, inertia: Array, dt: float) -> Drives:
-    """law: of the logs, leading axis windows, or None; inertia: `[nv]`; dt: s, control period."""
-    names = Channels.of(model).joints
-    own = None if law is None else jax.tree.map(lambda x: np.asarray(x[0]), law)
-    rows = [_drive(model, i, own) for i in range(model.nu)]
-    joints = [j for _, j, _ in rows]
-    v = np.array([model.jnt_dofadr[max(j, 0)] for j in joints], np.int64)
-    sharing = np.array([sum(j == other for other in joints) for j in joints], float)
-    unit = np.array([u for _, _, u in rows]) / np.where([k == "torque" for k, _, _ in rows], sharing, 1.0)
-    omega = min(BANDWIDTH, 0.25 / dt)
-    torque = np.array([k == "torque" for k, _, _ in rows])
-    speed = np.array([k == "velocity" for k, _, _ in rows])
-    return Drives(
-        kind=tuple(k for k, _, _ in rows),
-        joint=tuple(names[j] if j >= 0 else "" for j in joints),
-        q=np.array([model.jnt_qposadr[max(j, 0)] for j in joints], np.int64),
-        v=v,
-        unit=unit,
-        kp=unit * np.where(torque, inertia[v] * omega**2, np.where(speed, 2.0, 0.0)),
-        kd=unit * np.where(torque, 1.6 * omega * inertia[v], 0.0),
-    )
-
-
-def _drive(model: mujoco.MjModel, i: int, law: Any) -> tuple[str, int, float]:
-    """(kind, joint, ctrl per joint unit) of one actuator."""
-    j, gear = int(model.actuator_trnid[i, 0]), float(model.actuator_gear[i, 0])
-    gain = float(model.actuator_gainprm[i, 0])
-    axial = int(model.actuator_trntype[i]) <= 1 and int(model.jnt_type[j]) >= int(mujoco.mjtJoint.mjJNT_SLIDE)
-    if not axial:
-        return "none", -1, 0.0
-    if law is not None and law.on_position[i] > 0:
-        return "position", j, 1.0
-    if law is not None and law.on_velocity[i] > 0:
-        return "velocity", j, 1.0
-    scale = 1.0 if law is None else float(law.scale[i])
-    if int(model.actuator_gaintype[i]) != int(mujoco.mjtGain.mjGAIN_FIXED) or gain * gear * scale == 0:
-        return "none", j, 0.0
-    b = model.actuator_biasprm[i]
-    if b[1]:
-        return "position", j, float(-b[1] * gear / gain / scale)
-    if b[2]:
-        return "velocity", j, float(-b[2] * gear / gain / scale)
-    return "torque", j, 1.0 / (gain * gear * scale)
 
 
 def is_effort(mj_model: mujoco.MjModel, actuator: int) -> bool:
@@ -101,3 +30,106 @@ def dof_of(mj_model: mujoco.MjModel, actuator: int) -> int | None:
     joint = mj_model.actuator_trnid[actuator, 0]
     axial = mj_model.jnt_type[joint] >= int(mujoco.mjtJoint.mjJNT_SLIDE)
     return int(mj_model.jnt_dofadr[joint]) if axial else None
+
+
+def on_dofs(force: Array, model: mujoco.MjModel) -> Array:
+    """`[T, nu]` forces of actuators -> `[T, nv]` generalised forces of those on hinges and slides."""
+    out = np.zeros((len(force), model.nv))
+    for i in range(model.nu):
+        dof = dof_of(model, i)
+        if dof is not None:
+            out[:, dof] += model.actuator_gear[i, 0] * force[:, i]
+    return out
+
+
+class DeclaredLaw:
+    """The controller that a log declares, on plain arrays: command `[..., nu]`, qpos, qvel -> ctrl `[..., nu]`."""
+
+    def __init__(self, law: controllers.Law) -> None:
+        fields = ("on_position", "on_velocity", "kp", "kd", "limit", "scale")
+        self.numbers = tuple(np.asarray(getattr(law, name), float) for name in fields)
+        self.q, self.v = list(law.qadr), list(law.dadr)
+
+    def __call__(self, command: Array, qpos: Array, qvel: Array) -> Array:
+        on_position, on_velocity, kp, kd, limit, scale = self.numbers
+        q, w = qpos[..., self.q], qvel[..., self.v]
+        loop = np.where(on_position > 0, kp * (command - q) - kd * w, kp * (command - w)) * scale
+        return np.where(on_position + on_velocity > 0, np.clip(loop, -limit, limit), command * scale)
+
+
+def commanded(log: Log, model: mujoco.MjModel) -> Array:
+    """`[T, nu]`, forces that the commands ask of the actuators before the gear, through the law that the log declares.
+
+    Without a declared law the commands are ctrl. Forces are those of the model: f = gain u + b0 + b1 l + b2 dl/dt.
+    """
+    out = controlled(log, model)
+    for i in range(model.nu):
+        dof = dof_of(model, i)
+        gear, gain, bias = model.actuator_gear[i, 0], model.actuator_gainprm[i, 0], model.actuator_biasprm[i]
+        ctrl = np.clip(out[:, i], *model.actuator_ctrlrange[i]) if model.actuator_ctrllimited[i] else out[:, i]
+        out[:, i] = gain * ctrl
+        if dof is not None and model.actuator_biastype[i] == int(mujoco.mjtBias.mjBIAS_AFFINE):
+            length = gear * log.qpos[:, int(model.jnt_qposadr[model.dof_jntid[dof]])]
+            out[:, i] += bias[0] + bias[1] * length + bias[2] * gear * log.qvel[:, dof]
+        if model.actuator_forcelimited[i]:
+            out[:, i] = np.clip(out[:, i], *model.actuator_forcerange[i])
+    return out
+
+
+def controlled(log: Log, model: mujoco.MjModel) -> Array:
+    """`[T, nu]`, ctrl that the declared law makes of the commands; without one the commands themselves (a copy)."""
+    if not controllers.declared(log.metadata):
+        return log.ctrl.astype(float)
+    return DeclaredLaw(controllers.read(log.metadata, model, log.actuators, log.name))(log.ctrl, log.qpos, log.qvel)
+
+
+def measured(log: Log, actuator: int) -> Array | None:
+    """`[T]`, force of one actuator as it was logged, before the gear; None: not in every row."""
+    stream = log.streams.get(f"effort:{log.actuators[actuator]}")
+    return None if stream is None or not np.isfinite(stream).all() else np.asarray(stream)
+
+
+def measured_forces(log: Log, model: mujoco.MjModel) -> Array:
+    """`[T, nu]`, forces of the actuators as they were logged; 0 where they were not."""
+    each = [measured(log, i) for i in range(model.nu)]
+    return np.stack([np.zeros(len(log)) if x is None else x for x in each], 1) if each else np.zeros((len(log), 0))
+
+
+def centred(log: Log) -> Log:
+    """With commands at the middle of the time for which they hold."""
+    middle = log.time + 0.5 * np.append(np.diff(log.time), log.period)
+    ctrl = np.stack([np.interp(log.time, middle, c) for c in log.ctrl.T], 1) if log.ctrl.shape[1] else log.ctrl
+    return replace(log, ctrl=ctrl)
+
+
+def looped(log: Log) -> bool:
+    """Whether a position or velocity loop stands between the logged command and the actuator."""
+    given = log.metadata.get("controller")
+    blocks = [given, *given.values()] if isinstance(given, dict) else []
+    named = [str(b.get("law", "direct")).lower() for b in blocks if isinstance(b, dict)]
+    return any(controllers.ALIASES.get(n, "direct") != "direct" for n in named)
+
+
+@dataclass(frozen=True, eq=False)
+class Effort:
+    """What drove one joint: signal [T of the log], in the model's unit (N m, N) where `scaled`."""
+
+    joint: str
+    dof: int
+    source: str  # ctrl or effort
+    signal: Array
+    scaled: bool
+
+
+def efforts(log: Log, model: mujoco.MjModel) -> Iterator[Effort]:
+    """The efforts of every joint whose drives are all known: from the `effort:` streams, and from ctrl."""
+    dofs = [dof_of(model, i) for i in range(model.nu)]
+    shown = on_dofs(measured_forces(log, model), model)
+    asked = None if looped(log) else on_dofs(commanded(log, model), model)
+    for dof in sorted({d for d in dofs if d is not None}):
+        own = [i for i, d in enumerate(dofs) if d == dof]
+        joint = log.joints[int(model.dof_jntid[dof])]
+        if all(measured(log, i) is not None for i in own):
+            yield Effort(joint, dof, "effort", shown[:, dof], False)
+        if asked is not None and all(is_effort(model, i) for i in own):
+            yield Effort(joint, dof, "ctrl", asked[:, dof], True)

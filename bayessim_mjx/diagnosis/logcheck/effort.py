@@ -1,49 +1,51 @@
-"""Is a log's effort related to its motion? The best bounded linear model of the inverse dynamics has to explain it."""
+"""Is a log's effort related to its motion? The best bounded linear model of the inverse dynamics has to explain it.
+
+Bounds keep friction from standing in for a robot that is not there.
+"""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort
-from bayessim_mjx.diagnosis.logcheck.filtered_motion import Mask, bandwidth, filtered, motion
-from bayessim_mjx.diagnosis.logcheck.inverse_dynamics import Columns, Dynamics
+from bayessim_mjx.diagnosis.logcheck import loads
+from bayessim_mjx.diagnosis.logcheck.drives import Effort, efforts
+from bayessim_mjx.diagnosis.logcheck.regressor import (
+    FEWEST,
+    TILT,
+    Bounded,
+    Mask,
+    Regressor,
+    bandwidth,
+    filtered,
+    motion,
+)
+from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial, moving_bodies, nominal
+from bayessim_mjx.diagnosis.logcheck.timing import Late
 from bayessim_mjx.logs.log import Array, Log
-from bayessim_mjx.physics import controllers
 from bayessim_mjx.quantities import percent
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How much of a logged effort the motion has to bear out."""
+    """How much of a logged effort the motion has to bear out. Rules of thumb, not counted."""
 
     # share of the effort's variance explained
     refused: float = 0.3
     doubtful: float = 0.7
-    # s by which motion may follow the command for physical reasons: delay, lag, elasticity
+    # s by which motion may follow the command for physical reasons: delay, lag, elasticity; beyond it clocks disagree
     causal: tuple[float, float] = (-0.003, 0.15)
     loaded: float = 0.5  # of what another remedy leaves unexplained, which a load has to undercut
     # of what the lags of a robot leave unexplained, which those of a clock have to undercut
     far_better: float = 1 / 3
+    gain: float = 0.02  # of the variance, which a lag has to explain
     far: float = 0.5  # s, the largest offset between clocks that is looked for
 
 
 LIMITS = Limits()
-
-
-@dataclass(frozen=True, eq=False)
-class Effort:
-    """What drove one joint: signal [T of the log], in the model's unit (N m, N) where `scaled`."""
-
-    joint: str
-    dof: int
-    source: str  # ctrl or effort
-    signal: Array
-    scaled: bool
+FACTOR = 2.0  # a body's inertia and the actuator's gain may be wrong by this factor either way; a rule of thumb
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Relation:
     Attributes:
         explained: share of the variance, at the best lag that physics allows; None: not tested, `text` says why.
         friction: the share that friction and offset explain without any body.
-        lag: s by which the motion follows the effort.
+        late: the motion behind the effort; gain: share of the variance that this lag explains more than none.
         mend: what would mend it, or nothing.
         certain: the mend is a sign or a unit, which no robot has wrong.
     """
@@ -62,10 +64,16 @@ class Relation:
     source: str
     explained: float | None
     friction: float = 0.0
-    lag: float = 0.0
+    late: Late = Late(0.0)
+    gain: float = 0.0
     mend: str = ""
     certain: bool = False
     text: str = ""
+
+    @property
+    def lag(self) -> float:
+        """s by which the motion follows the effort, where that is worth a word; else 0."""
+        return self.late.seconds if self.gain >= LIMITS.gain else 0.0
 
     @property
     def refused(self) -> bool:
@@ -75,59 +83,23 @@ class Relation:
         return e is not None and (e < LIMITS.refused or (e < LIMITS.doubtful and vain))
 
 
-def efforts(log: Log, mj_model: mujoco.MjModel) -> Iterator[Effort]:
-    """The efforts of every joint whose drives are all known: from the `effort:` streams, and from ctrl."""
-    dofs = [dof_of(mj_model, i) for i in range(mj_model.nu)]
-    gear = mj_model.actuator_gear[:, 0]
-    for dof in sorted({d for d in dofs if d is not None}):
-        own = [i for i, d in enumerate(dofs) if d == dof]
-        joint = log.joints[int(mj_model.dof_jntid[dof])]
-        streams = [log.streams.get(f"effort:{log.actuators[i]}") for i in own]
-        if all(s is not None and np.isfinite(s).all() for s in streams):
-            yield Effort(joint, dof, "effort", sum(g * s for g, s in zip(gear[own], streams, strict=True)), False)
-        if all(is_effort(mj_model, i) for i in own) and not closed(log):
-            yield Effort(joint, dof, "ctrl", sum(gear[i] * _force(mj_model, i, log.ctrl[:, i]) for i in own), True)
-
-
-def closed(log: Log) -> bool:
-    """Whether a position or velocity loop stands between the logged command and the actuator."""
-    given = log.metadata.get("controller")
-    blocks = [given, *given.values()] if isinstance(given, dict) else []
-    named = [str(b.get("law", "direct")).lower() for b in blocks if isinstance(b, dict)]
-    return any(controllers.ALIASES.get(n, "direct") != "direct" for n in named)
-
-
-def _force(mj_model: mujoco.MjModel, i: int, ctrl: Array) -> Array:
-    if mj_model.actuator_ctrllimited[i]:
-        ctrl = np.clip(ctrl, *mj_model.actuator_ctrlrange[i])
-    force = mj_model.actuator_gainprm[i, 0] * ctrl
-    return np.clip(force, *mj_model.actuator_forcerange[i]) if mj_model.actuator_forcelimited[i] else force
-
-
 def relations(log: Log, mj_model: mujoco.MjModel) -> list[Relation]:
     """One relation per joint and source of effort."""
     found = list(efforts(log, mj_model))
     if not found:
         return []
     top = bandwidth(log)
-    pictures = []
-    for cutoff in sorted({max(3.0, top / 2), top}):  # the slower one is the quieter one
-        moved = motion(log, mj_model, cutoff)
-        pictures.append(Dynamics.of(mj_model, moved))
-    laden = functools.cache(lambda: [p.loaded(mj_model) for p in pictures])
-    return [_relation(log, mj_model, effort, pictures, laden) for effort in found]
+    cutoffs = sorted({max(3.0, top / 2), top})  # the slower one is the quieter one
+    pictures = [_Picture.of(log, mj_model, cutoff) for cutoff in cutoffs]
+    return [_relation(log, mj_model, effort, pictures) for effort in found]
 
 
 def _relation(
-    log: Log,
-    mj_model: mujoco.MjModel,
-    effort: Effort,
-    pictures: list[Dynamics],
-    laden: Callable[[], list[Dynamics]] | None = None,
+    log: Log, mj_model: mujoco.MjModel, effort: Effort, pictures: list[_Picture], laden: bool = False
 ) -> Relation:
-    """laden: the pictures with an unknown load, which is no fault of a log."""
+    """laden: with an unknown load, which is no fault of a log."""
     own = Relation(effort.joint, effort.source, None)
-    tests = [t for t in (_Test.of(log, effort, d) for d in pictures) if t.rows.sum() * t.step * t.cutoff >= 4.0]
+    tests = [t for t in (_Test.of(log, effort, p, laden) for p in pictures) if t.independent >= FEWEST]
     if not tests:
         return replace(own, text="too little motion, free of contacts and limits, to compare the effort with")
     if any(t.small for t in tests):
@@ -143,36 +115,82 @@ def _relation(
     physical = (lags >= LIMITS.causal[0]) & (lags <= LIMITS.causal[1])
     explained = max(float(c[physical].max()) for c in curves)
     best = float(curve.max())
-    relation = replace(own, explained=explained, friction=test.friction(), lag=_nearest(lags, curve))
-    if explained >= LIMITS.doubtful and 1.0 - best > LIMITS.far_better * (1.0 - explained):
-        # a periodic motion fits one period later too
-        relation = replace(relation, lag=_nearest(lags[physical], curve[physical]))
+    # a periodic motion fits one period later too
+    far = explained < LIMITS.doubtful or 1.0 - best <= LIMITS.far_better * (1.0 - explained)
+    late, gain = _nearest(lags, curve, physical | far, test.independent)
+    relation = replace(own, explained=explained, friction=test.friction(), late=late, gain=gain)
     if explained >= LIMITS.doubtful and not relation.lag:
         return relation
     share, mend, certain = (
         (best, "", False) if explained >= LIMITS.doubtful else _mend(log, mj_model, relation, curve, test)
     )
-    if laden is not None:
-        other = _relation(log, mj_model, effort, laden())
+    if not laden:
+        other = _relation(log, mj_model, effort, pictures, laden=True)
         told = other.explained or 0.0
         if told >= LIMITS.doubtful and not other.refused and 1.0 - told < LIMITS.loaded * (1.0 - share):
             return other
     return replace(relation, mend=mend, certain=certain)
 
 
-def _nearest(lags: Array, curve: Array) -> float:
-    """The smallest lag about as good as the best, between the grid's; 0 where the best is hardly better than none."""
-    best, now = float(curve.max()), float(np.interp(0.0, lags, curve))
-    if best - now < 0.02:
-        return 0.0
-    good = np.flatnonzero(curve >= best - min(0.002, 0.1 * (best - now)))
+def _nearest(lags: Array, curve: Array, allowed: Mask, count: float) -> tuple[Late, float]:
+    """The smallest lag that is about as good as the best of those allowed, and how much more than none it explains.
+
+    count: independent rows n. Of residuals with the variance s(lag) the likelihood is s^(-n/2), whose curvature at the
+    vertex of a parabola s = s0 + c (lag - lag0)^2 gives the error sqrt(s0 / (n c)).
+    """
+    best, now = float(curve[allowed].max()), float(np.interp(0.0, lags, curve))
+    good = np.flatnonzero(allowed & (curve >= best - min(0.002, 0.1 * (best - now))))
     k = int(good[np.argmin(np.abs(lags[good]))])
-    while 0 < k < len(lags) - 1 and max(curve[k - 1], curve[k + 1]) > curve[k]:
+    first, last = np.flatnonzero(allowed)[[0, -1]]
+    while first < k < last and max(curve[k - 1], curve[k + 1]) > curve[k]:
         k += 1 if curve[k + 1] > curve[k - 1] else -1  # to the top of its hill
-    if k in (0, len(lags) - 1):
-        return float(lags[k])
+    if k in (0, len(lags) - 1) or max(curve[k - 1], curve[k + 1]) > curve[k]:
+        return Late(float(lags[k])), best - now  # no top lies among the lags
     left, top, right = curve[k - 1 : k + 2]  # the vertex of the parabola through them
-    return float(lags[k] + 0.5 * (lags[1] - lags[0]) * (left - right) / min(left - 2 * top + right, -1e-12))
+    bend, step = max(2 * top - left - right, 1e-12), float(lags[1] - lags[0])
+    error = step * float(np.sqrt(max(1.0 - top, 0.0) / (0.5 * bend * max(count, 1.0))))
+    return Late(float(lags[k] + 0.5 * step * (right - left) / bend), error), best - now
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """The regressor of a log's motion at one cutoff: a column for each body at nominal inertia, and for loads.
+
+    Loads are 1 kg at and around the last links' centres of mass, of which there may be `most` kg `[P]`.
+    """
+
+    own: Regressor
+    bodies: int
+    most: Array
+
+    @classmethod
+    def of(cls, log: Log, model: mujoco.MjModel, cutoff: float) -> _Picture:
+        inertia, moving = nominal(model), moving_bodies(model)
+        sets, most = list(np.eye(len(moving))[:, :, None] * inertia), []
+        for body, place, heaviest in loads.at_the_ends(model):
+            sets.append(np.zeros_like(inertia))
+            sets[-1][moving.index(body)] = inertial(1.0, place, np.zeros((3, 3)))
+            most.append(heaviest)
+        return cls(Regressor.of(model, motion(log, model, cutoff), sets=np.array(sets)), len(moving), np.array(most))
+
+    def bounded(self, dof: int, laden: bool) -> Bounded:
+        """The linear model of the effort at one degree of freedom.
+
+        Inertias within FACTOR, springs and friction only with the sign of springs and friction, gravity tilted by up to
+        TILT, any offset, and with `laden` loads.
+        """
+        own, shown = self.own, lambda x: np.abs(x).max(axis=0) > 1e-9
+        loose = np.stack([own.own[n][:, dof] for n in ("one", "speed", "dry", "drag", "acceleration")], 1)
+        travel = own.own["position"][:, dof]
+        parts = np.column_stack([own.columns[:, dof, : self.bodies], own.spring[:, dof]])
+        load, tilt = own.columns[:, dof, self.bodies :], own.tilt[:, dof]
+        felt = shown(load) & laden
+        parts, tilt = parts[:, shown(parts)], tilt[:, shown(tilt)]
+        x = np.column_stack([loose, travel - travel.mean(), parts, tilt, load[:, felt]])
+        rigid, turned = np.ones(parts.shape[1]), np.full(tilt.shape[1], TILT)
+        low = np.concatenate([[-np.inf], np.zeros(5), rigid / FACTOR, -turned, np.zeros(felt.sum())])
+        high = np.concatenate([np.full(6, np.inf), rigid * FACTOR, turned, self.most[felt]])
+        return Bounded(x, low, high, slice(6, 6 + len(rigid)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,55 +199,56 @@ class _Test:
 
     log: Log
     effort: Effort
-    picture: Dynamics
-    columns: Columns
+    picture: _Picture
+    model: Bounded
     rows: Mask
 
     @classmethod
-    def of(cls, log: Log, effort: Effort, picture: Dynamics) -> _Test:
-        return cls(log, effort, picture, picture.columns(effort.dof), picture.moved.moving(effort.dof))
+    def of(cls, log: Log, effort: Effort, picture: _Picture, laden: bool = False) -> _Test:
+        return cls(log, effort, picture, picture.bounded(effort.dof, laden), picture.own.moved.moving(effort.dof))
 
     @property
     def signal(self) -> Array:
-        return filtered(self.effort.signal, self.log, self.picture.moved)
-
-    @property
-    def step(self) -> float:
-        return self.picture.moved.step
+        return filtered(self.effort.signal, self.log, self.picture.own.moved)
 
     @property
     def cutoff(self) -> float:
-        return self.picture.moved.cutoff
+        return self.picture.own.moved.cutoff
+
+    @property
+    def independent(self) -> float:
+        """How many independent rows its rows are."""
+        return float(self.rows.sum()) * self.picture.own.moved.share
 
     @property
     def small(self) -> bool:
-        y = self.signal[self.rows]
-        force = (self.picture.bodies.sum(0) - self.picture.weight)[self.rows, self.effort.dof]
+        """Whether the effort hardly changes against the forces of inertia."""
+        y, own = self.signal[self.rows], self.picture.own
+        force = (own.columns[..., : self.picture.bodies].sum(-1) - own.weight)[self.rows, self.effort.dof]
         idle = float(y.std()) <= 1e-6 * float(np.abs(y).max()) + 1e-12
         return idle or (self.effort.scaled and float(y.std()) < 0.1 * float(np.sqrt(np.mean(force**2))))
 
     def over(self, lags: Array) -> Array:
         """[L] share explained where the effort is delayed by each lag."""
-        signals = filtered(self.effort.signal, self.log, self.picture.moved, lags)
-        return self.columns.explained(signals, self.rows, self.effort.scaled)
+        signals = filtered(self.effort.signal, self.log, self.picture.own.moved, lags)
+        return self.model.explained(signals, self.rows, self.effort.scaled)
 
     def friction(self) -> float:
-        return float(self.columns.friction().explained(self.signal[None], self.rows)[0])
+        return float(self.model.friction().explained(self.signal[None], self.rows)[0])
 
     def share(self, rows: Mask | None = None, sign: float = 1.0, scaled: bool | None = None) -> float:
         """Explained without a lag, over other rows, with the other sign or at any scale."""
         scaled = self.effort.scaled if scaled is None else scaled
-        return float(self.columns.explained(sign * self.signal[None], self.rows if rows is None else rows, scaled)[0])
+        return float(self.model.explained(sign * self.signal[None], self.rows if rows is None else rows, scaled)[0])
 
     def pieces(self) -> list[tuple[float, float]]:
         """Spans [s since the start] that the model does explain, from windows of a tenth of the log, at least 2 s."""
-        moved = self.picture.moved
+        moved = self.picture.own.moved
         edges = np.arange(moved.time[0], moved.time[-1] + 1e-9, max(2.0, 0.1 * self.log.duration))
         spans: list[tuple[float, float]] = []
         for a, b in zip(edges[:-1], edges[1:], strict=True):
             rows = self.rows & (moved.time >= a) & (moved.time < b)
-            enough = rows.sum() * moved.step * moved.cutoff >= 3.0
-            if enough and self.share(rows) > 0.9:
+            if rows.sum() * moved.share >= FEWEST and self.share(rows) > 0.9:
                 start = (
                     spans.pop()[0] if spans and abs(spans[-1][1] - (a - moved.time[0])) < 1e-6 else a - moved.time[0]
                 )
@@ -260,5 +279,4 @@ def _in_radians(log: Log, mj_model: mujoco.MjModel, test: _Test) -> float:
     if np.abs(log.qpos).max() < 6.0:
         return 0.0
     radians = replace(log, qpos=np.radians(log.qpos), qvel=np.radians(log.qvel))
-    picture = Dynamics.of(mj_model, motion(radians, mj_model, test.cutoff))
-    return _Test.of(radians, test.effort, picture).share()
+    return _Test.of(radians, test.effort, _Picture.of(radians, mj_model, test.cutoff)).share()

@@ -9,10 +9,12 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.diagnosis.logcheck import single_log
-from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort
+from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort, looped
 from bayessim_mjx.diagnosis.logcheck.effort import LIMITS as OF_EFFORT
-from bayessim_mjx.diagnosis.logcheck.effort import Relation, closed, relations
+from bayessim_mjx.diagnosis.logcheck.effort import Relation, relations
+from bayessim_mjx.diagnosis.logcheck.links import offsets
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding, refuse, warn
+from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing, pooled
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import Velocity, agreeing, velocities
@@ -23,11 +25,9 @@ FEW = 3  # names that a sentence lists
 
 @dataclass(frozen=True)
 class Limits:
-    """When two logs count as the same motion, and when measurements come late."""
+    """When a joint follows its target. A rule of thumb, not counted."""
 
     alike: float = 5.0  # at most so many times a target's range is the range of what follows it
-    # s; a larger offset between commands and motion is a fault of the clocks, not of the robot
-    late: float = 0.3
 
 
 LIMITS = Limits()
@@ -62,10 +62,12 @@ class Gate:
 
     Attributes:
         qvel: per measured velocity channel, whether it agrees with its position in most of the usable logs.
+        timing: of the usable logs.
     """
 
     reports: tuple[Report, ...]
     qvel: dict[str, bool]
+    timing: Timing
 
     @property
     def usable(self) -> tuple[Log, ...]:
@@ -111,10 +113,10 @@ class Gate:
         own = iter(logs)
         return replace(self, reports=tuple(replace(r, log=next(own)) if r.usable else r for r in self.reports))
 
-    def shifted(self, late: float) -> Gate:
-        """With logs whose commands act `late` s later than they did."""
-        reports = tuple(replace(r, log=r.log.shifted(late)) for r in self.reports)
-        return replace(self, reports=reports)
+    def clocked(self, commands: Late, moved: float) -> Gate:
+        """With the lateness of the commands, and with logs whose commands act `moved` s later than they did."""
+        reports = tuple(replace(r, log=r.log.shifted(moved)) for r in self.reports) if moved else self.reports
+        return replace(self, reports=reports, timing=self.timing.with_commands(commands, moved))
 
     def _not_compared(self) -> tuple[str, ...]:
         """One sentence per reason: many logs of many joints would bury everything else."""
@@ -135,17 +137,27 @@ class Gate:
 
 
 def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
-    """Judge every log against the model and the control period dt [s]. Nothing is raised: read the verdict.
+    """Judge every log against the model and the control period dt [s]. No fault of the motion raises: read the verdict.
 
     Raises:
-        UserError: dt is no time.
+        UserError: dt is no time, or a log declares a controller that cannot be read.
     """
     if not (np.isfinite(dt) and dt > 0):
         raise UserError(f"gate: dt = {dt!r}; allowed: seconds > 0")
     reports = tuple(_report(log, mj_model, dt) for log in logs)
-    seen = [v for r in reports if r.usable for v in r.velocities]
-    step = max([dt, *(r.log.period for r in reports if r.usable)])
-    return Gate(reports, agreeing(seen, step))
+    usable = [r for r in reports if r.usable]
+    seen = [v for r in usable for v in r.velocities]
+    periods = [r.log.period for r in usable]
+    motion = pooled((e.joint, e.late) for r in usable for e in _first(r.relations))
+    velocities = pooled((v.channel, Late(v.lag)) for v in seen)
+    efforts = pooled(own for r in usable if not r.log.lost for own in offsets(r.log, mj_model))
+    timing = Timing(float(np.median(periods)) if periods else dt, dt, velocities, motion, efforts)
+    return Gate(reports, agreeing(seen, max([dt, *periods])), timing)
+
+
+def _first(related: Sequence[Relation]) -> list[Relation]:
+    """One relation of each joint that was tested: a stream of efforts comes before the command."""
+    return [*{r.joint: r for r in reversed(related) if r.explained is not None}.values()]
 
 
 def unusable(log: Log, dt: float) -> bool:
@@ -174,7 +186,7 @@ def _targets(log: Log, mj_model: mujoco.MjModel) -> dict[str, Array]:
     out: dict[str, Array] = {}
     dofs = [dof_of(mj_model, i) for i in range(mj_model.nu)]
     for i, dof in enumerate(dofs):
-        if dof is not None and dofs.count(dof) == 1 and (closed(log) or not is_effort(mj_model, i)):
+        if dof is not None and dofs.count(dof) == 1 and (looped(log) or not is_effort(mj_model, i)):
             out[log.joints[int(mj_model.dof_jntid[dof])]] = log.ctrl[:, i]
     return out
 
@@ -215,7 +227,8 @@ def _of_effort(related: Sequence[Relation]) -> list[Finding]:
             out.append(warn(f"{text} ({r.mend})" if r.mend else text))
         if r.lag and r not in bad:
             text = f"{r.joint}: its motion follows the effort ({r.source}) {r.lag * 1e3:+.0f} ms late"
-            out.append(warn(f"{text}: do the clocks agree?") if abs(r.lag) > LIMITS.late else Finding("finding", text))
+            physical = OF_EFFORT.causal[0] <= r.lag <= OF_EFFORT.causal[1]
+            out.append(Finding("finding", text) if physical else warn(f"{text}: do the clocks agree?"))
     return out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -15,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Limits:
-    """When a load beside the model explains more than the model."""
+    """How far out a robot may carry something. Rules of thumb, not counted."""
 
     # reach of a load: of the body's own size, of the robot's length
     beside: float = 1.2
@@ -87,6 +88,15 @@ def weight(model: mujoco.MjModel, body: int) -> float:
 def reach(model: mujoco.MjModel, body: int) -> float:
     """m from the body's centre of mass to that of what it may carry: beyond the body itself, a tool's length."""
     return max(LIMITS.beside * size(model, body), LIMITS.out * _length(model, body))
+
+
+def at_the_ends(model: mujoco.MjModel) -> Iterator[tuple[int, Array, float]]:
+    """(body, place `[3]` m in its frame, kg that may be there), at and around the last links' centres of mass."""
+    jointed = np.flatnonzero(model.body_jntnum)
+    above = {int(model.body_weldid[model.body_parentid[b]]) for b in jointed}
+    for body in (int(b) for b in jointed if int(b) not in above):
+        for side in np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]):
+            yield body, model.body_ipos[body] + reach(model, body) * side, weight(model, body)
 
 
 def _length(model: mujoco.MjModel, body: int) -> float:

@@ -16,19 +16,20 @@ from bayessim_mjx.quantities import percent
 
 @dataclass(frozen=True)
 class Limits:
-    """What one log has to have, and which values are no measurements."""
+    """What one log has to have, and which values are no measurements. Rules of thumb, not counted."""
 
     # fewer rows or control steps than this hold no window
     min_rows: int = 20
     min_steps: int = 10
     clipped: float = 0.05  # share of the rows on one flat top
     held: float = 0.01  # of a target's range: it does not change
-    moment: float = 0.05  # s
+    moment: float = 0.05  # s, over which a speed is taken
+    # values that a register of 16 or of 32 bits holds
     registers: tuple[float, float] = (2.0**16, 2.0**32)
 
 
 LIMITS = Limits()
-_FASTEST = {"hinge": 150.0, "slide": 50.0}  # rad/s, m/s; faster: probably another unit
+_FASTEST = {"hinge": 150.0, "slide": 50.0}  # rad/s, m/s; faster: probably another unit (a rule of thumb)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ Array = NDArray[np.float64]
 class Rules:
     """What is tried, and how much is looked at.
 
-    Error rates: benchmarks/results.md, "Diagnosis: one decision".
+    All of 8 cases with coloured noise and jitter are called noise, all of 8 unknown causes forces: the rule was made on
+    these. Of 48 fresh unknown causes none was called noise (c3b3eb0).
 
     Attributes:
         memories: of a window's length; amounts: of the white part's variance; a grid each.

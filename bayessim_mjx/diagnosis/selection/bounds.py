@@ -21,7 +21,8 @@ from bayessim_mjx.physics import Physics
 class Widening:
     """How ranges grow, and when an estimate is at the end of one."""
 
-    # rules of thumb, none counted alone; error rates with them are those of d462f0c in benchmarks/results.md
+    # rules of thumb, none counted alone; with them 9 of 10 single effects were named, and there was no alarm in 6 cases
+    # (31 fresh cases, d462f0c)
     near: float = 0.001  # of a range: at its end
     # a range grows by this factor, up to so many times what it was at first
     twice: float = 2.0

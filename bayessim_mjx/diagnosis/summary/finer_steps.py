@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting import windows
-from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts, refined
-from bayessim_mjx.diagnosis.fitting.simulator import FAR, Simulator
+from bayessim_mjx.diagnosis.fitting.simulator import FAR, Simulator, physics_of
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.summary.whole_logs import theta_of
 from bayessim_mjx.physics import staggered

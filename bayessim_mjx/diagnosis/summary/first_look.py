@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from bayessim_mjx.diagnosis.equation_error.channel import Channel
-from bayessim_mjx.diagnosis.equation_error.look import Joint, Look
+from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Joint, Look
 from bayessim_mjx.diagnosis.equation_error.search import Proposal
+from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel
 from bayessim_mjx.diagnosis.phrases import titled
 from bayessim_mjx.quantities import listed, percent
 

@@ -23,7 +23,7 @@ class Limits:
     """When a verdict says that something remains unexplained.
 
     Rules of thumb, chosen on 22 recorded cases in which something was named: what is rightly named left 3 % of the gap
-    at most, causes that the library lacks 8 to 60 %. Rates on cases that came later: benchmarks/results.md.
+    at most, causes that the library lacks 8 to 60 %. Rates on later cases: benchmarks/records/diagnosis_fresh.json.
     """
 
     # noise standard deviations that remain: of a simulator without effects, and beside effects that leave a large

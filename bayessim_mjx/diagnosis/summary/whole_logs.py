@@ -13,8 +13,7 @@ from bayessim_mjx.device import cores
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting import windows
-from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
-from bayessim_mjx.diagnosis.fitting.simulator import Simulator
+from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import KNOWN, Model, of_noise, systematic

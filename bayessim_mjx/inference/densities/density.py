@@ -1,4 +1,4 @@
-"""What a density is: that part of the network which lies between standardised summaries and the heads of the mixture.
+"""Densities: the part of the network between standardised summaries and the heads of the mixture.
 
 The heads (mdn.py) make a mixture of Gaussians of whatever a density computes, as products, quotients, marginals and
 corrections need closed forms.

@@ -9,8 +9,8 @@ from jax import Array
 
 from bayessim_mjx.inference.densities.density import Density, Drop, Params, register
 from bayessim_mjx.inference.settings import InferenceSettings
+from bayessim_mjx.keys import GOLDEN
 
-GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio
 # between the keys of layers: those of points of the curve are GOLDEN apart (train.py); a constant of MurmurHash3
 DEEPER = np.uint32(0x85EBCA6B)
 

@@ -1,4 +1,4 @@
-"""What a summary is, and what all of them share.
+"""Summaries: their contract, and the functions that all of them share.
 
 Rows: states[t] is before and states[t + 1] after actions[t]. `valid` [T] is 1 while the episode ran: what comes after
 counts as standing still with the last action held, whatever the arrays hold there. The network standardises each
@@ -18,7 +18,7 @@ from bayessim_mjx.config.names import SUMMARIES
 from bayessim_mjx.errors import UserError
 
 Summarizer = Callable[..., Array]  # (states [T+1, S], actions [T, A], valid [T] or nothing) -> [D]
-MAX_FEATURES = 16384  # 10 000 trajectories of as many features are 0.6 GiB, and a network sees each of them
+MAX_FEATURES = 16384  # 10 000 trajectories of as many features are 0.6 GiB; source: memory alone
 
 
 class Stream(NamedTuple):
@@ -40,7 +40,7 @@ class Summary:
         ending: the option of `function` that a whole number at the end of the name sets; None: it takes none.
         names: (T, names of the states, names of the actions, its option) -> a name for each feature; None: numbers.
         stream: (T, S, A, its option) -> Stream; None: it needs the whole trajectory.
-        embedding: (T, S, A) -> a network that learns features from these (embedding.py); None: they are features.
+        embedding: (T, S, A) -> a network that learns features from these (learned.py); None: they are features.
     """
 
     name: str

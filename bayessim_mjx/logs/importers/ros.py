@@ -4,55 +4,28 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.importers.controller_state import field_used, of_controller, state_of, targets
+from bayessim_mjx.logs.importers.messages import (
+    COMMANDS,
+    CONTROLLER,
+    FIELDS,
+    IMU,
+    KINDS,
+    STATE,
+    Choice,
+    Clock,
+    Kind,
+    Message,
+    streams,
+)
+from bayessim_mjx.logs.importers.publishers import of_one_publisher, several_senders
 from bayessim_mjx.logs.importers.streams import Recording, Stream
-
-STATE, IMU = "JointState", "Imu"
-COMMANDS = ("Float64MultiArray", "Float64", "JointTrajectory")
-KINDS = (STATE, IMU, *COMMANDS)
-FIELDS = ("position", "velocity", "effort")
-FAR = 1_000_000_000  # ns between stamp and receipt: two clocks
-Kind = Literal["measured", "held", "linear"]
-
-
-@dataclass(frozen=True)
-class Message:
-    """One message; `kind` is its type without the package, `received` in ns."""
-
-    topic: str
-    kind: str
-    received: int
-    body: Any
-
-    @property
-    def stamp(self) -> int:
-        """ns of its header; of messages without one, or with 0 in it, when it was received."""
-        stamp = getattr(getattr(self.body, "header", None), "stamp", None)
-        if stamp is None:
-            return self.received
-        return int(stamp.sec) * 10**9 + int(stamp.nanosec) or self.received
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Which topics to read, and how; what is left open is found by the topics' types and names.
-
-    Attributes:
-        states: topic of the joint states.
-        commands: {topic: names of its values, or none where messages name them}.
-        field: position, velocity or effort, where a command has several.
-        stamps: header, or received: when a message was recorded.
-    """
-
-    states: str | None = None
-    commands: Mapping[str, Sequence[str]] | None = None
-    field: str | None = None
-    stamps: str = "header"
 
 
 def recording(name: str, messages: Iterable[Message], choice: Choice) -> Recording:
@@ -61,97 +34,92 @@ def recording(name: str, messages: Iterable[Message], choice: Choice) -> Recordi
     Raises:
         UserError: topics that are missing or that cannot be told apart, arrays whose order is not known.
     """
-    by_topic: dict[str, list[Message]] = defaultdict(list)
+    topics = _Topics()
     for message in messages:
         if message.kind in KINDS:
-            by_topic[message.topic].append(message)
-    commands = _command_topics(name, by_topic, choice)
-    states = _state_topic(name, by_topic, choice, commands)
+            topics.of[message.topic].append(message)
+        else:
+            topics.unread[message.topic] = message.kind
+    by_topic = topics.of
+    commands = _command_topics(name, topics, choice)
+    states = _state_topic(name, topics, choice, commands)
     imus = [t for t, found in by_topic.items() if found[0].kind == IMU]
-    clock = _Clock.of([m for t in (states, *commands, *imus) for m in by_topic[t]], choice.stamps)
-    measured = {f: _joints(by_topic[states], f, clock) for f in FIELDS}
+    stamped = [m for t in dict.fromkeys((states, *commands, *imus)) for m in by_topic[t]]
+    clock = Clock.of(stamped, choice.stamps)
+    told = of_one_publisher(name, states, [state_of(m) for m in by_topic[states]], choice.publisher, clock.received)
+    measured = {f: _joints(told, f, clock) for f in FIELDS}
     sent: dict[str, Stream] = {}
     for topic, names in commands.items():
         streams = _commands(name, topic, by_topic[topic], names or (), list(measured["position"]), choice, clock)
         if twice := sorted(set(streams) & set(sent)):
             raise UserError(f"{name}: {topic} and another topic command {twice[0]!r}; choose by --commands TOPIC")
         sent |= streams
-    others = {k: s for t in imus for k, s in _imu(t, by_topic[t], clock, len(imus) > 1).items()}
+    others = {
+        k: s for t in commands if by_topic[t][0].kind == CONTROLLER for k, s in targets(by_topic[t], clock).items()
+    }
+    others |= {k: s for t in imus for k, s in _imu(t, by_topic[t], clock, len(imus) > 1).items()}
     notes = [f"{name}: states {states}; commands {', '.join(commands)}", *clock.notes]
+    notes += [f"{name}: {t}: {used}" for t in commands if (used := field_used(by_topic[t], choice))]
+    notes += several_senders(name, commands, by_topic)
+    if topics.unread:
+        notes.append(f"{name}: not read, as their types are not known here: {topics.left()}")
     return Recording(name, measured["position"], sent, measured["velocity"], measured["effort"], others, notes)
 
 
-@dataclass(frozen=True)
-class _Clock:
-    """Time stamps as seconds since `origin` (ns)."""
+@dataclass
+class _Topics:
+    """Messages by topic, and the types of topics that cannot be read."""
 
-    origin: int
-    received: bool
-    notes: tuple[str, ...] = ()
+    of: dict[str, list[Message]] = field(default_factory=lambda: defaultdict(list))
+    unread: dict[str, str] = field(default_factory=dict)
 
-    @classmethod
-    def of(cls, messages: Sequence[Message], stamps: str) -> _Clock:
-        """By headers, unless they are of another clock than that of the messages that have none."""
-        apart = float(np.median([abs(m.stamp - m.received) for m in messages if m.stamp != m.received] or [0]))
-        bare = any(m.stamp == m.received for m in messages)
-        mixed = stamps == "header" and bare and apart > FAR
-        note = (
-            f"headers are {apart * 1e-9:.3g} s away from the recorder's clock and commands have none: --stamps received"
-        )
-        by_receipt = stamps == "received" or mixed
-        origin = min(m.received if by_receipt else m.stamp for m in messages)
-        return cls(origin, by_receipt, (note,) if mixed else ())
+    def told(self) -> str:
+        read = ", ".join(f"{topic} ({found[0].kind})" for topic, found in self.of.items()) or "none of use"
+        return f"it has {read}" + (f"; cannot be read: {self.left()}" if self.unread else "")
 
-    def __call__(self, message: Message) -> float:
-        return ((message.received if self.received else message.stamp) - self.origin) * 1e-9
+    def left(self) -> str:
+        return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self.unread.items()))
+
+    def of_kind(self, *kinds: str) -> list[str]:
+        return [t for t, found in self.of.items() if found[0].kind in kinds]
 
 
-def _told(by_topic: Mapping[str, list[Message]]) -> str:
-    return ", ".join(f"{topic} ({found[0].kind})" for topic, found in by_topic.items()) or "none of use"
-
-
-def _command_topics(name: str, by_topic: Mapping[str, list[Message]], choice: Choice) -> Mapping[str, Sequence[str]]:
+def _command_topics(name: str, topics: _Topics, choice: Choice) -> Mapping[str, Sequence[str]]:
     if choice.commands:
-        absent = [t for t in choice.commands if t not in by_topic]
+        absent = [t for t in choice.commands if t not in topics.of]
         if absent:
-            raise UserError(f"{name}: --commands {absent[0]}: no such topic; it has {_told(by_topic)}")
+            raise UserError(f"{name}: --commands {absent[0]}: no such topic; {topics.told()}")
         return choice.commands
-    found = {t: () for t, m in by_topic.items() if m[0].kind in COMMANDS or (m[0].kind == STATE and "command" in t)}
+    found = [*topics.of_kind(*COMMANDS), *(t for t in topics.of_kind(STATE) if "command" in t)]
+    found = found or topics.of_kind(CONTROLLER)  # where nothing else commands, a controller says what it was told
     if not found:
-        raise UserError(f"{name}: no topic of commands; it has {_told(by_topic)}; allowed: --commands TOPIC")
-    return found
+        raise UserError(f"{name}: no topic of commands; {topics.told()}; allowed: --commands TOPIC")
+    return {topic: () for topic in found}
 
 
-def _state_topic(name: str, by_topic: Mapping[str, list[Message]], choice: Choice, commands: Iterable[str]) -> str:
-    found = [t for t, m in by_topic.items() if m[0].kind == STATE and t not in commands]
+def _state_topic(name: str, topics: _Topics, choice: Choice, commands: Iterable[str]) -> str:
+    found = [t for t in topics.of_kind(STATE) if t not in commands]
     if choice.states is not None:
-        if choice.states not in found:
-            raise UserError(f"{name}: --states {choice.states}: no topic of JointState; it has {_told(by_topic)}")
+        if choice.states not in [*found, *topics.of_kind(CONTROLLER)]:
+            raise UserError(f"{name}: --states {choice.states}: no topic of JointState; {topics.told()}")
         return choice.states
+    found = found or topics.of_kind(CONTROLLER)
     named = [t for t in found if t.rpartition("/")[2] == "joint_states"]
     best = found if len(found) == 1 else named
     if len(best) != 1:
-        raise UserError(
-            f"{name}: {len(found)} topics of joint states; it has {_told(by_topic)}; allowed: --states TOPIC"
-        )
+        raise UserError(f"{name}: {len(found)} topics of joint states; {topics.told()}; allowed: --states TOPIC")
     return best[0]
 
 
-def _joints(messages: Sequence[Message], field: str, clock: _Clock, kind: Kind = "measured") -> dict[str, Stream]:
+def _joints(messages: Sequence[Message], what: str, clock: Clock, kind: Kind = "measured") -> dict[str, Stream]:
     """{joint: stream} of one field, whatever the order of joints in each message; fields may be empty."""
     samples: dict[str, list[tuple[float, float]]] = defaultdict(list)
     for message in messages:
-        values = getattr(message.body, field)
+        values = getattr(message.body, what)
         for joint, value in zip(message.body.name, values, strict=False):
             if np.isfinite(value):
                 samples[str(joint)].append((clock(message), float(value)))
-    return _streams(samples, kind)
-
-
-def _streams(samples: Mapping[str, Sequence[tuple[float, float]]], kind: Kind) -> dict[str, Stream]:
-    return {
-        joint: Stream(np.array([t for t, _ in s]), np.array([x for _, x in s]), kind) for joint, s in samples.items()
-    }
+    return streams(samples, kind)
 
 
 def _commands(
@@ -161,11 +129,13 @@ def _commands(
     names: Sequence[str],
     joints: Sequence[str],
     choice: Choice,
-    clock: _Clock,
+    clock: Clock,
 ) -> dict[str, Stream]:
     kind = messages[0].kind
     if kind == STATE:
         return _joints(messages, _field(name, topic, [m.body for m in messages], FIELDS, choice), clock, "held")
+    if kind == CONTROLLER:
+        return of_controller(name, topic, messages, choice, clock)
     if kind == "JointTrajectory":
         return _trajectory(name, topic, messages, choice, clock)
     each = [np.atleast_1d(np.asarray(m.body.data, float)) for m in messages]
@@ -200,7 +170,7 @@ def _field(name: str, topic: str, bodies: Sequence[Any], fields: Sequence[str], 
     return (wanted or filled)[0]
 
 
-def _trajectory(name: str, topic: str, messages: Sequence[Message], choice: Choice, clock: _Clock) -> dict[str, Stream]:
+def _trajectory(name: str, topic: str, messages: Sequence[Message], choice: Choice, clock: Clock) -> dict[str, Stream]:
     """Points run linearly from one to the next; a new message takes the place of what is left of the one before."""
     points = [point for m in messages for point in m.body.points]
     fields = ("positions", "velocities", "effort")
@@ -216,10 +186,10 @@ def _trajectory(name: str, topic: str, messages: Sequence[Message], choice: Choi
             for joint, value in zip(message.body.joint_names, getattr(point, field), strict=False):
                 samples[str(joint)].append((began + ahead if len(message.body.points) > 1 else began, float(value)))
     several = any(len(m.body.points) > 1 for m in messages)
-    return _streams(samples, "linear" if several else "held")
+    return streams(samples, "linear" if several else "held")
 
 
-def _imu(topic: str, messages: Sequence[Message], clock: _Clock, several: bool) -> dict[str, Stream]:
+def _imu(topic: str, messages: Sequence[Message], clock: Clock, several: bool) -> dict[str, Stream]:
     time = np.array([clock(m) for m in messages])
     prefix = f"{topic.strip('/').replace('/', '.')}." if several else "imu."
     out = {}
@@ -228,3 +198,6 @@ def _imu(topic: str, messages: Sequence[Message], clock: _Clock, several: bool) 
             values = np.array([getattr(getattr(m.body, quantity), axis) for m in messages])
             out[f"{prefix}{short}.{axis}"] = Stream(time, values)
     return out
+
+
+__all__ = ["Choice", "Message", "recording"]

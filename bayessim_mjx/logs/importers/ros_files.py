@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.importers.messages import KINDS, Message
 from bayessim_mjx.logs.importers.needs import needs
-from bayessim_mjx.logs.importers.ros import KINDS, Message
 
 
 def of_mcap(path: Path) -> Iterator[Message]:
@@ -23,17 +24,15 @@ def of_mcap(path: Path) -> Iterator[Message]:
         with path.open("rb") as file:
             reader = reader_of(file, decoder_factories=[decoder])
             summary = reader.get_summary()
-            schemas = summary.schemas.values() if summary else ()
-            topics = [
-                c.topic
-                for c in (summary.channels.values() if summary else ())
-                if any(s.id == c.schema_id and _short(s.name) in KINDS for s in schemas)
-            ]
+            schemas = summary.schemas if summary else {}
+            kinds = [(c.topic, _name(schemas.get(c.schema_id))) for c in (summary.channels.values() if summary else ())]
+            topics = [topic for topic, kind in kinds if _short(kind) in KINDS]
+            yield from (Message(topic, kind, 0, None) for topic, kind in kinds if topic not in topics)
             if summary is not None and not topics:  # an empty list would mean all of them
                 return
             for schema, channel, message, body in reader.iter_decoded_messages(topics=topics or None):
-                kind = _short(schema.name if schema else "")
-                yield Message(channel.topic, kind, int(message.publish_time or message.log_time), body)
+                kind, sent = _short(_name(schema)), int(message.publish_time or message.log_time)
+                yield Message(channel.topic, kind, sent, body, str(channel.id))
     except (errors, EOFError) as error:
         raise UserError(f"{path}: not a readable MCAP file of ROS 2 messages ({error})") from None
 
@@ -50,13 +49,21 @@ def of_rosbag(path: Path) -> Iterator[Message]:
     try:
         with highlevel.AnyReader([path], default_typestore=store) as reader:
             wanted = [c for c in reader.connections if _short(c.msgtype) in KINDS]
+            for c in reader.connections:
+                if c not in wanted:
+                    yield Message(c.topic, c.msgtype, 0, None)
             for connection, received, raw in reader.messages(connections=wanted) if wanted else ():
                 body = reader.deserialize(raw, connection.msgtype)
-                yield Message(connection.topic, _short(connection.msgtype), int(received), body)
+                sender = str(getattr(connection.ext, "callerid", None) or "")
+                yield Message(connection.topic, _short(connection.msgtype), int(received), body, sender)
     except highlevel.AnyReaderError as error:
         raise UserError(
             f"{path}: not a readable ROS bag ({error}); allowed: a .bag file or the folder of a bag"
         ) from None
+
+
+def _name(schema: Any) -> str:
+    return str(schema.name) if schema else ""
 
 
 def _short(name: str) -> str:

@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.equation_error.leads import proposed
-from bayessim_mjx.diagnosis.equation_error.look import look
+from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check
+from bayessim_mjx.diagnosis.equation_error.proposals import proposed
 from tests.diagnosis.recordings import record
 
 PAIR = """<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody><body>
@@ -23,7 +23,7 @@ def together(t: float, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("left", "right"), [(0.7, 1.0), (1.0, 1.3)])
 def test_a_motor_that_shares_a_joint_has_a_gain_of_its_own(left: float, right: float):
     logs = [record(PAIR.format(left=left, right=right), together, name=f"{k}.npz", seed=k) for k in range(3)]
-    seen = look(logs, mujoco.MjModel.from_xml_string(PAIR.format(left=1, right=1)))
+    seen = check(logs, mujoco.MjModel.from_xml_string(PAIR.format(left=1, right=1)))
     (found,) = seen.proposals
     wrong, gain = ("left", left) if left != 1.0 else ("right", right)
     assert found.label == f"actuator_gain@{wrong}"

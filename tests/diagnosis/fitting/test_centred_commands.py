@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting import windows
-from bayessim_mjx.diagnosis.fitting.centred_commands import physics_of
-from bayessim_mjx.diagnosis.fitting.simulator import Simulator
+from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
 from bayessim_mjx.effects import make
 from tests.diagnosis.pendulums import PERIOD, nominal, recorded
 

@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.fitting import discretisation, robot, stepping
+from bayessim_mjx.diagnosis.fitting import discretisation, integrator_choice, robot
 from bayessim_mjx.diagnosis.fitting.cutting import windows_of
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
-from bayessim_mjx.diagnosis.fitting.substeps import Errors
+from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
 from bayessim_mjx.diagnosis.setup import _measured
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
@@ -209,7 +209,7 @@ def test_runge_and_kutta_step_in_where_sub_steps_do_not_suffice():
         tried.append(int(own.mj_model.opt.integrator))
         return _measured(own, recorded, None, False, limit, **rest)
 
-    found = stepping.stepping(the(ARM), PERIOD, recorded, measured_by)
+    found = integrator_choice.choose(the(ARM), PERIOD, recorded, measured_by)
     assert tried[-1] == mujoco.mjtIntegrator.mjINT_RK4 and len(tried) == 2
     assert not found.worth.beyond() and "by RK4 at" in found.said()[0]
     assert found.robot.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
@@ -219,7 +219,7 @@ def test_runge_and_kutta_step_in_where_sub_steps_do_not_suffice():
 def test_runge_and_kutta_step_in_where_what_sub_steps_leave_moves_the_evidence(noise, by):
     """All of it is far within the tolerance, and below the noise of a row: over all rows it is a nat and more."""
     recorded, limit = logs(ARM, swing, noise=noise), np.full(2, 0.05)
-    found = stepping.stepping(
+    found = integrator_choice.choose(
         the(ARM), PERIOD, recorded, lambda own, **rest: _measured(own, recorded, None, False, limit, **rest)
     )
     assert found.robot.mj_model.opt.integrator == getattr(mujoco.mjtIntegrator, by)
@@ -228,7 +228,7 @@ def test_runge_and_kutta_step_in_where_what_sub_steps_leave_moves_the_evidence(n
 
 def test_the_better_integrator_takes_derivatives_from_the_cheaper_one_and_finds_what_it_finds_alone():
     recorded, limit = logs(ARM, swing, noise=1e-5), np.full(2, 0.05)
-    found = stepping.stepping(
+    found = integrator_choice.choose(
         the(ARM), PERIOD, recorded, lambda own, **rest: _measured(own, recorded, None, False, limit, **rest)
     )
     errors = found.worth.errors
@@ -248,19 +248,19 @@ def test_where_time_is_limited_the_integrator_stays_unless_a_search_by_the_bette
         asked.append(seconds)
         return False
 
-    found = stepping.stepping(
+    found = integrator_choice.choose(
         the(ARM), PERIOD, recorded, lambda own, **rest: _measured(own, recorded, None, False, limit, **rest), affordable
     )
     assert found.robot.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    assert stepping.TOO_LONG in found.said()
+    assert integrator_choice.TOO_LONG in found.said()
     (seconds,) = asked
-    assert seconds == stepping.STAGES * found.worth.errors.seconds > 0
+    assert seconds == integrator_choice.STAGES * found.worth.errors.seconds > 0
 
 
 def test_logs_of_a_simulation_keep_its_integrator():
     """Without noise nobody knows whether their step was this one."""
     recorded, limit = logs(ARM, swing, finer=1, noise=0.0), np.full(2, 0.05)
-    found = stepping.stepping(
+    found = integrator_choice.choose(
         the(ARM), PERIOD, recorded, lambda own, **rest: _measured(own, recorded, None, False, limit, **rest)
     )
     assert found.robot.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST

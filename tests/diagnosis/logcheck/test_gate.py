@@ -122,6 +122,13 @@ def test_the_reason_names_what_would_mend_it(good: Log) -> None:
     refused(degrees, "positions in degrees would explain")
 
 
+def test_commands_in_a_unit_that_the_log_declares_are_forces_of_the_model(good: Log) -> None:
+    counts = dataclasses.replace(good, ctrl=20 * good.ctrl)
+    warned(counts, "no model explains")
+    declared = judge(dataclasses.replace(counts, metadata={"controller": {"law": "direct", "scale": 0.05}}))
+    assert declared.usable and not declared.warnings and (declared.reports[0].relations[0].explained or 0) > 0.98
+
+
 def test_one_hidden_push_leaves_the_rest_usable(good: Log) -> None:
     rows = np.arange(len(good)) > 450
     pushed = good.ctrl - np.where(rows, 8 * np.sin(7 * good.time) * good.ctrl[:, 0], 0.0)[:, None]

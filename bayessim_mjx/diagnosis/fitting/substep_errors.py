@@ -1,0 +1,191 @@
+"""Windows simulated without effects at any sub-step, by one compiled program; what start states can take away."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx import programs
+from bayessim_mjx.device import on_cores
+from bayessim_mjx.diagnosis.fitting.quadratic import START_STEP, eliminate
+from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
+from bayessim_mjx.physics import Drive, Physics, begin, staggered, substep
+from bayessim_mjx.physics.tangent import difference, integrate
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How sub-steps are compared. Rules of thumb, not counted."""
+
+    starts: int = 5  # Newton steps of the start states, at most
+    falls: float = 0.99  # of the misfit that a step leaves: with more they are at their end
+    nudge: float = 0.0001  # rad or rad/s, at least, of the start states for their finite differences
+
+
+SIZES = Sizes()
+
+
+def held(cut: Windows) -> Windows:
+    """Windows whose commands are held over the whole control step, as in training."""
+    length, substeps = cut.batch.command.shape[1:3]
+    rows = np.stack([cut.logs[r].ctrl[a : a + length] for r, a in zip(cut.log, cut.start, strict=True)])
+    command = jnp.asarray(np.repeat(rows[:, :, None], substeps, 2), jnp.float32)
+    return dataclasses.replace(cut, batch=cut.batch.replace(command=command))
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What windows are simulated with.
+
+    Attributes:
+        cut: the windows, with their commands.
+        offsets: `[W, 2 nv]`, changes of the start states besides those that were fitted.
+        theta: `[P]`, parameters; None: nominal.
+        force: `[W, H, nv]`, generalised force that acts besides.
+    """
+
+    cut: Windows
+    offsets: Array | None = None
+    theta: Array | None = None
+    force: Array | None = None
+
+
+class Errors:
+    """Windows without effects at any sub-step, by one compiled program: measured minus simulated, `[W, H, 2 nv]`.
+
+    Args:
+        cut: the windows, with commands for the coarsest sub-steps that are asked for; most: the finest factor.
+        cheaper: the same windows by an integrator that costs less, with their start states fitted: derivatives are
+            taken there, and start states begin there.
+    """
+
+    def __init__(self, physics: Physics, cut: Windows, most: int, cheaper: Errors | None = None) -> None:
+        self.physics, self.cut, self.most, self.cheaper = physics, cut, most * physics.substeps, cheaper
+        self.first = cut.batch.command.shape[2] // physics.substeps
+        self.theta = np.asarray(physics.space.nominal, np.float32)
+        nothing = np.zeros((len(cut), 2 * physics.mj_model.nv))
+        self.offsets: Array = nothing if cheaper is None else cheaper.offsets  # of the measured start states
+        self.seconds = 0.0  # that a case took of those simulated last
+        self._moved: tuple[Array, Array] | None = None  # start states, and the derivatives there
+        self._no_force = np.zeros((len(cut), cut.steps, physics.mj_model.nv), np.float32)
+        axes = (0, 0, 0, None, None, None, None)
+        self._run = programs.Kept(jax.vmap(self._one, in_axes=axes), programs.traced_from(physics, "sub-steps"))
+
+    def run(self, cut: Windows, factor: int, corrected: bool = True, offsets: Array | None = None) -> Array:
+        """With the commands of `cut` at the sub-step h / factor; corrected: velocities lie half of that early."""
+        return self.run_each([Case(cut, offsets)], factor, corrected)[0]
+
+    def run_each(self, cases: Sequence[Case], factor: int, corrected: bool = True) -> Array:
+        """Several cases, `[n, W, H, 2 nv]`, one on each core: together a window costs as much as apart."""
+        h = np.float32(self.physics.mj_model.opt.timestep / factor)
+
+        def one(case: Case) -> Array:
+            count = case.cut.batch.command.shape[2]
+            missing = [(0, 0), (0, 0), (0, self.most - count), (0, 0)]
+            command = np.pad(np.asarray(case.cut.batch.command), missing)  # the past keeps its shape
+            batch = self.cut.batch.replace(command=command)
+            offsets = self.offsets if case.offsets is None else self.offsets + case.offsets
+            force = self._no_force if case.force is None else np.asarray(case.force, np.float32)
+            theta = np.asarray(self.theta if case.theta is None else case.theta, np.float32)
+            given = np.asarray(offsets, np.float32), force, theta
+            return np.asarray(self._run(batch, *given, count, h, np.float32(corrected)), np.float64)
+
+        began = time.monotonic()
+        found = np.stack(on_cores(one, cases))
+        self.seconds = (time.monotonic() - began) / len(cases)
+        return np.nan_to_num(found, nan=1e3, posinf=1e3, neginf=-1e3)
+
+    def _one(self, own: Batch, *given: jax.Array) -> jax.Array:
+        with jax.default_matmul_precision("highest"):
+            return self._errors(own, *given)
+
+    def _errors(
+        self,
+        own: Batch,
+        offset: jax.Array,
+        force: jax.Array,
+        theta: jax.Array,
+        count: jax.Array,
+        h: jax.Array,
+        corrected: jax.Array,
+    ) -> jax.Array:
+        physics, nv = self.physics, self.physics.mj_model.nv
+        world = begin(physics, theta, own.around)
+        world = world.replace(qpos=integrate(physics.mj_model, world.qpos, offset[:nv]), qvel=world.qvel + offset[nv:])
+        model = physics.model_of(world).tree_replace({"opt.timestep": h})
+        early = 0.5 * corrected * h if staggered(physics.mj_model) else 0.0
+
+        def step(data: Any, row: tuple) -> tuple[Any, tuple]:
+            command, enabled, extra = row
+            seen = {"qpos": data.qpos, "qvel": data.qvel}
+            drive = Drive(extra, enabled, own.law)
+
+            def sub(k: jax.Array, data: Any) -> Any:
+                return substep(physics, model, data.replace(ctrl=command[k]), ((), ()), (), seen, drive)[0]
+
+            data = jax.lax.fori_loop(0, count, sub, data)
+            return data, (data.qpos, data.qvel + early * data.qacc)
+
+        _, (qpos, qvel) = jax.lax.scan(step, physics.data_of(world), (own.command, own.enabled, force))
+        error = jax.vmap(lambda a, b: difference(physics.mj_model, a, b))(own.qpos, qpos)
+        return jnp.concatenate([error, own.qvel - qvel], axis=1)
+
+    def columns(self, sigma: Array, here: Array | None = None) -> Array:
+        """`[W, n, 2 nv]`, minus the derivatives of the whitened errors by the start states; here: the errors there."""
+        if self.cheaper is not None:
+            return self.cheaper.columns(sigma)
+        if self._moved is None or self._moved[0] is not self.offsets:
+            here = self.run(self.cut, self.first) if here is None else here
+            nudges = np.diag(np.maximum(START_STEP * self.cut.spread, SIZES.nudge))
+            there = self.run_each([Case(self.cut, np.tile(n, (len(self.cut), 1))) for n in nudges], self.first)
+            each = [(here - error) / n.max() for n, error in zip(nudges, there, strict=True)]
+            self._moved = self.offsets, np.stack(each, -1)
+        moved = self._moved[1] / sigma[:, None]
+        return np.asarray(moved.reshape(len(moved), -1, moved.shape[-1]))
+
+    def differences(self, factor: int) -> Errors:
+        """Where differences at the sub-step h / factor are taken: they need no better integrator than this one."""
+        other = self.cheaper
+        return self if other is None or not other.first <= factor <= other.most // other.physics.substeps else other
+
+    def start(self, sigma: Array) -> None:
+        """Fit the start states: far from the measured motion the time step is worth something else."""
+        here = self.run(self.cut, self.first)
+        for _ in range(SIZES.starts):
+            step = _step(here / sigma, self.columns(sigma, here), self.offsets, self.cut.spread)
+            there = self.run(self.cut, self.first, offsets=step)
+            before, after = (np.sum((error / sigma) ** 2, (1, 2)) for error in (here, there))
+            better = after < before
+            if better.any():
+                self.offsets = self.offsets + np.where(better[:, None], step, 0.0)
+            here = np.where(better[:, None, None], there, here)
+            if np.minimum(before, after).sum() > SIZES.falls * before.sum():
+                break
+
+    def settler(self, sigma: Array) -> Callable[[Array], Array]:
+        """Errors -> errors that no change of the start states takes away, by linearisation."""
+        columns, spread = self.columns(sigma), self.cut.spread
+
+        def settle(error: Array) -> Array:
+            step = _step(error / sigma, columns, np.zeros_like(self.offsets), spread)
+            moved = np.einsum("wns,ws->wn", columns, step).reshape(error.shape)
+            return np.asarray((error / sigma - moved) * np.where(np.isfinite(sigma), sigma, 0.0))
+
+        return settle
+
+
+def _step(whitened: Array, columns: Array, offsets: Array, spread: Array) -> Array:
+    """Best change of the start states `[W, 2 nv]`."""
+    r = whitened.reshape(len(whitened), -1)
+    nothing = np.zeros((*r.shape, 0))
+    return eliminate(r, nothing, columns, offsets, spread)[1].step(nothing, np.zeros(0))

@@ -1,0 +1,202 @@
+"""Inverse dynamics as a linear function of inertial parameters: ten columns of every moving body.
+
+The regressor of Atkeson, An and Hollerbach (1986): a body's mass, mass times centre of mass (3) and inertia about its
+frame (xx, yy, zz, xy, xz, yz), all in the body's own frame. Bodies welded together move as one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+INERTIAL = 10
+BLOCK = 2000  # rows at a time
+_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def moving_bodies(model: mujoco.MjModel) -> list[int]:
+    """Bodies that move on their own, one of each set that is welded together."""
+    return [b for b in range(1, model.nbody) if model.body_weldid[b] == b]
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Where the moving bodies are, and how they move, along a motion.
+
+    Attributes:
+        bodies: `[B]`; linear, angular: `[T, B, 3, nv]`, Jacobians of their frames' origins, in the bodies' own axes.
+        spin, turning, felt: `[T, B, 3]`, angular velocity and acceleration, and acceleration less gravity of the
+            origin, in the bodies' own axes; down: `[T, B, 3]`, gravity likewise.
+        rotation: `[T, B, 3, 3]`, body to world; bias: `[T, nv]`, M 0 + c of the nominal model (no acceleration).
+    """
+
+    bodies: tuple[int, ...]
+    linear: Array
+    angular: Array
+    spin: Array
+    turning: Array
+    felt: Array
+    down: Array
+    rotation: Array
+    bias: Array
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> Frames:
+        """Along a motion `[T, nq]`, `[T, nv]`, `[T, nv]`."""
+        bodies, data = moving_bodies(model), mujoco.MjData(model)
+        rows, count, nv = len(qpos), len(bodies), model.nv
+        jp, jr, dp, dr = (np.zeros((rows, count, 3, nv)) for _ in range(4))
+        rotation, bias = np.zeros((rows, count, 3, 3)), np.zeros((rows, nv))
+        for k in range(rows):
+            data.qpos[:], data.qvel[:] = qpos[k], qvel[k]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_comVel(model, data)
+            mujoco.mj_rne(model, data, 0, bias[k])
+            for i, body in enumerate(bodies):
+                point = data.xpos[body]
+                mujoco.mj_jac(model, data, jp[k, i], jr[k, i], point, body)
+                mujoco.mj_jacDot(model, data, dp[k, i], dr[k, i], point, body)
+                rotation[k, i] = data.xmat[body].reshape(3, 3)
+        gravity = np.where(int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY), 0, model.opt.gravity)
+        origin = _times(jp, qacc) + _times(dp, qvel)
+        turned = _times(jr, qacc) + _times(dr, qvel)
+        own = np.swapaxes(rotation, -1, -2)  # world to body
+        put = lambda x: np.einsum("tbij,tbj->tbi", own, x)  # noqa: E731
+        down = put(np.broadcast_to(gravity, origin.shape))
+        return cls(
+            tuple(bodies), own @ jp, own @ jr, put(_times(jr, qvel)), put(turned), put(origin) - down, down,
+            rotation, bias,
+        )  # fmt: skip
+
+    def columns(self) -> Array:
+        """`[T, B, nv, 10]`, the generalised force that a unit of each inertial parameter asks for."""
+        return self._columns(self.felt, self.turning, self.spin)
+
+    def tilted(self, direction: Array) -> Array:
+        """`[T, B, nv, 10]` of gravity alone, pointing along a direction `[3]` of the world with its length."""
+        own = np.einsum("tbji,j->tbi", self.rotation, direction)
+        return self._columns(-own, np.zeros_like(own), np.zeros_like(own))
+
+    def weight(self) -> Array:
+        """`[T, B, nv, 10]` of gravity alone, as it is."""
+        return self._columns(-self.down, np.zeros_like(self.down), np.zeros_like(self.down))
+
+    def _columns(self, felt: Array, turning: Array, spin: Array) -> Array:
+        skew = _skew(turning) + _skew(spin) @ _skew(spin)
+        force = np.zeros((*felt.shape, INERTIAL))  # [T, B, 3, 10]
+        moment = np.zeros_like(force)
+        force[..., 0], force[..., 1:4] = felt, skew
+        moment[..., 1:4] = -_skew(felt)
+        moment[..., 4:] = _of_inertia(turning) + _skew(spin) @ _of_inertia(spin)
+        both = np.swapaxes(self.linear, -1, -2) @ force + np.swapaxes(self.angular, -1, -2) @ moment
+        return np.asarray(both)
+
+
+def _times(jacobian: Array, speed: Array) -> Array:
+    """`[T, B, 3, nv]` times `[T, nv]`."""
+    return np.einsum("tbiv,tv->tbi", jacobian, speed)
+
+
+def _skew(v: Array) -> Array:
+    """`[..., 3, 3]` of the cross product with v."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return out - np.swapaxes(out, -1, -2)
+
+
+def _of_inertia(w: Array) -> Array:
+    """`[..., 3, 6]`: inertia times w as a function of the six moments."""
+    out = np.zeros((*w.shape, 6))
+    for k, (i, j) in enumerate(_PAIRS):
+        out[..., i, k] = w[..., j]
+        if i != j:
+            out[..., j, k] = w[..., i]
+    return out
+
+
+def inertial(mass: float, centre: Array, about_centre: Array) -> Array:
+    """`[10]` of a mass with its centre and its inertia `[3, 3]` about it, both in the body's axes."""
+    moment = about_centre + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    return np.array([mass, *(mass * centre), *(moment[i, j] for i, j in _PAIRS)])
+
+
+def nominal(model: mujoco.MjModel) -> Array:
+    """`[B, 10]`, inertial parameters of the moving bodies with what is welded to them."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    bodies = moving_bodies(model)
+    out = np.zeros((len(bodies), INERTIAL))
+    for i, body in enumerate(bodies):
+        frame = data.xmat[body].reshape(3, 3)
+        for part in np.flatnonzero(model.body_weldid == body):
+            own = frame.T @ data.ximat[part].reshape(3, 3)
+            centre = frame.T @ (data.xipos[part] - data.xpos[body])
+            moment = own @ np.diag(model.body_inertia[part]) @ own.T
+            out[i] += inertial(float(model.body_mass[part]), centre, moment)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Rigid:
+    """Generalised forces that rigid bodies need for a motion.
+
+    Attributes:
+        columns: `[T, nv, K]`, per unit of each (set of) inertial parameters.
+        nominal: `[T, nv]`, of the model's own; weight: the part of it that is gravity; bias: without acceleration.
+        tilt: `[T, nv, 2]`, per rad by which the world is turned about its x and y axis.
+    """
+
+    columns: Array
+    nominal: Array
+    weight: Array
+    bias: Array
+    tilt: Array
+
+
+def rigid(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array, sets: Array | None = None) -> Rigid:
+    """Of a motion `[T, nq]`, `[T, nv]`, `[T, nv]`.
+
+    Args:
+        sets: `[K, B, 10]`, inertial parameters of which each column is made; None: one column each, of body after body.
+    """
+    own, parts = nominal(model), []
+    falls = [-np.cross(axis, model.opt.gravity) for axis in np.eye(3)[:2]]
+    for a in range(0, len(qpos), BLOCK):  # Jacobians of all rows of a long log would not fit into memory
+        rows = slice(a, a + BLOCK)
+        frames = Frames.of(model, qpos[rows], qvel[rows], qacc[rows])
+        each = frames.columns()
+        columns = np.moveaxis(each, 1, 2) if sets is None else np.einsum("tbvk,cbk->tvc", each, sets)
+        needed = np.einsum("tbvk,bk->tv", each, own)
+        down, *tilt = (np.einsum("tbvk,bk->tv", x, own) for x in (frames.weight(), *map(frames.tilted, falls)))
+        shape = (*needed.shape, -1)
+        parts.append((columns.reshape(shape), needed, down, frames.bias, np.stack(tilt, -1)))
+    return Rigid(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+
+
+def recursive(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> Array:
+    """`Rigid.nominal` alone, by MuJoCo's recursive Newton-Euler."""
+    data, out = mujoco.MjData(model), np.zeros_like(qvel)
+    for k, row in enumerate(out):
+        data.qpos[:], data.qvel[:], data.qacc[:] = qpos[k], qvel[k], qacc[k]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        mujoco.mj_rne(model, data, 1, row)
+    return out
+
+
+def springs(model: mujoco.MjModel, qpos: Array) -> Array:
+    """`[T, nv]`, effort that holds the model's own springs at positions `[T, nq]`."""
+    data, out = mujoco.MjData(model), np.zeros((len(qpos), model.nv))
+    for k, q in enumerate(qpos):
+        data.qpos[:] = q
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        out[k] = -data.qfrc_spring
+    return out

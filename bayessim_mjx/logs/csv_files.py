@@ -1,0 +1,162 @@
+"""CSV files as tables: delimiter, header, lines of units, and the marks in their numbers."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.numerals import marks_of
+from bayessim_mjx.logs.table import Table
+from bayessim_mjx.logs.texts import lines_of, named_delimiter
+
+ALLOWED = "allowed: CSV with a header line, or NPZ"
+DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
+
+
+@dataclass(frozen=True)
+class Form:
+    """How a CSV file is written.
+
+    Attributes:
+        delimiter: one character. header: whether there is a line of names.
+        skip_rows: lines before the header, or before the first row where there is none.
+        skip_after_header: lines between the header and the first row.
+        encoding, decimal, thousands: as the map states them, or None.
+        lenient: a row of the wrong length becomes one that holds nothing (`bad_rows`).
+    """
+
+    delimiter: str = ","
+    header: bool = True
+    skip_rows: int = 0
+    skip_after_header: int = 0
+    encoding: str | None = None
+    decimal: str | None = None
+    thousands: str | None = None
+    lenient: bool = False
+
+
+def read_csv(path: Path, form: Form | None = None) -> Table:
+    """Read a CSV file; columns of a file without a header line are called 0, 1, 2 ...
+
+    A column without a name is called `unnamed <its number>`, or left out where it is blank throughout, as after a comma
+    at the end of each line.
+
+    Raises:
+        UserError: no rows, a repeated column, a row of the wrong length, another delimiter, encoding or header.
+    """
+    form = form or Form()
+    text = lines_of(path, form.encoding, ALLOWED)[form.skip_rows :]
+    own = named_delimiter(text[0]) if text and not form.skip_rows else None
+    text, skipped = (text[1:], 1) if own else (text, form.skip_rows)
+    delimiter = own or form.delimiter
+    try:
+        lines = list(csv.reader(text, delimiter=delimiter))
+    except csv.Error as error:
+        raise UserError(f"{path}: not a text file ({error}); {ALLOWED}") from None
+    if delimiter == " ":
+        lines = _in_blanks(text, lines)
+    while lines and not any(f.strip() for f in lines[-1]):
+        lines.pop()
+    body = lines[1 + form.skip_after_header :] if form.header else lines[form.skip_after_header :]
+    if not body:
+        raise UserError(f"{path}: no data rows; allowed: a header line and one row per sample")
+    names = [f.strip().lstrip("#").strip() for f in lines[0]] if form.header else [str(i) for i in range(len(body[0]))]
+    _other_delimiter(path, names, lines)
+    if form.header:
+        _no_header(path, lines[0], names)
+    unnamed = [i for i, name in enumerate(names) if not name]
+    names = [name or f"unnamed {i}" for i, name in enumerate(names)]
+    repeated = sorted({n for n in names if names.count(n) > 1})
+    if repeated:
+        mend = "`header: false` and `skip_rows: 1` in a map number the columns from 0"
+        raise UserError(f"{path}: column {repeated[0]!r} appears more than once in the header; {mend}")
+    first = skipped + form.skip_after_header + (2 if form.header else 1)
+    ragged = {row: f"{len(fields)} fields" for row, fields in enumerate(body) if len(fields) != len(names)}
+    if ragged and not form.lenient:
+        row = min(ragged)
+        at = f"{path}: line {row + first} has {ragged[row]}; allowed: {len(names)} ({', '.join(names)})"
+        raise UserError(at + _why_ragged(text, body, names, delimiter, ragged))
+    if form.header and not form.lenient:
+        _units_row(path, body, first)
+    body = [[""] * len(names) if row in ragged else fields for row, fields in enumerate(body)]
+    marks = marks_of(body, form.decimal, form.thousands)
+    columns = {name: [r[i] for r in body] for i, name in enumerate(names)}
+    blank = {names[i] for i in unnamed if not any(r[i].strip() for r in body)}
+    columns = {name: column for name, column in columns.items() if name not in blank}
+    return Table(path, columns, first, lenient=form.lenient, ragged=ragged, marks=marks)
+
+
+def _in_blanks(text: Sequence[str], lines: list[list[str]]) -> list[list[str]]:
+    """Columns that are set out by several blanks, and a `#` that stands alone before the names."""
+    if len({len(fields) for fields in lines if fields}) > 1:
+        split = [line.split() for line in text]
+        if split and split[0][:1] == ["#"]:
+            split[0] = split[0][1:]
+        if len({len(fields) for fields in split if fields}) == 1:
+            return split
+    return lines
+
+
+def _other_delimiter(path: Path, names: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
+    table = next((i for i, fields in enumerate(lines) if len(fields) > 1), 0) if len(names) == 1 else 0
+    if table and sum(len(fields) > 1 for fields in lines) > 0.5 * len(lines):
+        raise UserError(
+            f"{path}: the first line ({names[0]!r}) is one field, and line {table + 1} has {len(lines[table])}; "
+            f"`skip_rows` in a map (here {table} more) passes over lines before the header"
+        )
+    other = next((d for d in DELIMITERS if d in names[0]), None) if len(names) == 1 else None
+    if other is not None:
+        mend = f"`delimiter: {other!r}` in a map (docs/logs.md)"
+        raise UserError(
+            f"{path}: one column {names[0]!r}: its fields are parted by {DELIMITERS[other]}; mend it with {mend}"
+        )
+
+
+def _no_header(path: Path, fields: Sequence[str], names: Sequence[str]) -> None:
+    """A first line of numbers with fractions is no header; whole numbers may be names."""
+    if all(map(is_number, names)) and not all(name.lstrip("+-").isdigit() for name in names):
+        text = f"{path}: the first line ({', '.join(fields[:4])} ...) holds numbers, not names"
+        raise UserError(f"{text}; `header: false` in a map numbers the columns from 0, and keeps that line as a row")
+
+
+def _units_row(path: Path, body: Sequence[Sequence[str]], first: int) -> None:
+    """A line of words above lines of numbers is a line of units."""
+    if len(body) < 3:
+        return
+    words = [not is_number(f) and bool(f.strip()) for f in body[0]]
+    numbers = [[is_number(f) for f in fields] for fields in body[1:3]]
+    both = [all(column) for column in zip(*numbers, strict=True)]
+    if sum(both) >= 2 and all(word or not f.strip() for word, f in zip(words, body[0], strict=True)) and any(words):
+        text = f"{path}: line {first} ({', '.join(body[0][:4])} ...) holds words above columns of numbers"
+        raise UserError(f"{text}; `skip_after_header: 1` in a map passes over a line of units")
+
+
+def _why_ragged(
+    text: Sequence[str], body: Sequence[Sequence[str]], names: Sequence[str], delimiter: str, ragged: Mapping[int, str]
+) -> str:
+    """What may be behind rows of other lengths, and the keys that mend it."""
+    if delimiter == "," and len(ragged) == len(body) and all(len(fields) == 2 * len(names) for fields in body):
+        return (
+            "; each row has twice as many: commas separate the fields and are decimal marks too, and the two cannot be "
+            "distinguished; write the file with `delimiter: ';'` and `decimal: ','`, or with decimal points"
+        )
+    for other, word in DELIMITERS.items():
+        counts = {line.count(other) for line in text if line.strip()}
+        if other not in (delimiter, " ") and len(counts) == 1 and counts != {0}:
+            return f"; its fields may be parted by {word}: `delimiter: {other!r}` in a map"
+    return "; `bad_rows: drop` in a map leaves such rows out, `skip_rows` passes over lines before the header"
+
+
+def is_number(text: str) -> bool:
+    """Whether a field holds a number, with a decimal point or comma."""
+    try:
+        float(text.strip().replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+__all__ = ["DELIMITERS", "Form", "is_number", "read_csv"]

@@ -1,0 +1,166 @@
+"""Units that nobody stated, where names or values say that they are not the model's."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs import units
+from bayessim_mjx.logs.log import Array, Channels
+from bayessim_mjx.logs.mapping import LogMap, Source
+from bayessim_mjx.logs.table import Table
+from bayessim_mjx.logs.turns import TURN, servos
+
+DEGREE = units.ANGLES["deg"]
+PLAIN = ("rad", "m", "rad/s", "m/s", "N m", "N", None)
+FAR = 3.0  # times a joint's range, which readings in the model's unit never reach, however loose the range is
+ALIKE = 0.8  # correlation from which a joint follows its target
+RATIO = 1.25  # within which a ratio of amplitudes is that of two units
+
+
+def check_units(
+    table: Table,
+    columns: Mapping[str, Array],
+    channels: Channels,
+    model: mujoco.MjModel,
+    log_map: LogMap,
+    through: NDArray[np.bool_],
+    declared: NDArray[np.bool_] | None = None,
+) -> None:
+    """Channels are in the model's units, or the map states theirs.
+
+    Args:
+        columns: channels [T] in the model's units, as far as the map states them.
+        through: [nu], commands that go to the actuators as they are.
+        declared: [nu], targets of a position law that the log declares.
+
+    Raises:
+        UserError: another unit in a column's name, a unit of another kind than the joint, values that fit the joint
+            or its target in another unit only; names the keys of the map.
+    """
+    sources = {name: source for name, source, _ in log_map.channels()}
+    kinds = dict(zip(channels.joints, channels.kinds, strict=True))
+    followed = dict(servos(model, through, declared))
+    for name, source in sources.items():
+        stream, _, own = name.partition(":")
+        if source.value is None and stream in ("ctrl", "qpos", "qvel"):
+            _kind(log_map, name, source, kinds.get(own, ""))
+            _by_name(table, log_map, name, source, followed, channels)
+    unstated = {name for name in columns if name not in sources or not sources[name].stated}
+    for j, joint in enumerate(channels.joints):
+        kind, name = channels.kinds[j], f"qpos:{joint}"
+        if kind in ("hinge", "slide") and model.jnt_limited[j] and name in unstated:
+            _by_range(table, name, columns[name], kind, *map(float, model.jnt_range[j]))
+        elif kind == "hinge" and name in unstated:
+            _many_turns(table, name, columns[name])
+    for i, j in followed.items():
+        pair = f"qpos:{channels.joints[j]}", f"ctrl:{channels.actuators[i]}"
+        if unstated & set(pair):
+            _by_target(table, *pair, columns)
+
+
+def _key(name: str, column: object, unit: str) -> str:
+    stream, _, own = name.partition(":")
+    needs = {units.COUNTS: ", resolution: COUNTS_PER_TURN", units.PERCENT: ", range: [AT_0, AT_100]"}
+    more = needs.get(unit, ", torque_constant: NM_PER_A" if stream == "ctrl" and unit in units.CURRENTS else "")
+    return f"`{stream}: {{{own}: {{column: {column!r}, unit: {unit}{more}}}}}`"
+
+
+def _kind(log_map: LogMap, name: str, source: Source, kind: str) -> None:
+    """No angles of slides and no lengths of hinges."""
+    angular = {"hinge": units.LENGTHS, "slide": {**units.ANGLES, units.COUNTS: 1.0}}.get(kind, {})
+    if source.unit is not None and source.unit in angular:
+        key = name.replace(":", ".")
+        allowed = "an angle's unit" if kind == "hinge" else "m, mm, cm or percent, or `scale` in m"
+        raise UserError(f"{log_map.path}: {key}.unit = {source.unit!r} of a {kind} joint; allowed: {allowed}")
+
+
+def _by_name(
+    table: Table, log_map: LogMap, name: str, source: Source, followed: Mapping[int, int], channels: Channels
+) -> None:
+    column = source.name(table, name)
+    unit = units.of_name(column)
+    stream, _, own = name.partition(":")
+    if source.stated or column == name or unit in PLAIN or unit in units.TIMES:
+        return
+    if stream == "ctrl":
+        target = channels.actuators.index(own) in followed
+        if target is not (unit in (*units.ANGLES, units.COUNTS)) and unit == units.COUNTS:
+            return
+    text = f"{table.path}: column {column!r}: its name says {unit}, and the map does not state its unit"
+    keep = "`scale: 1` in that place, if the values are in the model's unit all the same"
+    raise UserError(f"{text}; allowed: {_key(name, column, str(unit))} in the map, or {keep}")
+
+
+def _by_range(table: Table, name: str, x: Array, kind: str, low: float, high: float) -> None:
+    """Values beyond the joint's range that another unit would bring into it."""
+    outside = np.abs(x) > max(FAR * max(abs(low), abs(high)), TURN if kind == "hinge" else 0.0)
+    if np.mean(outside) < 0.02:
+        return
+    if kind == "hinge" and np.ptp(x) < min(high - low, TURN) and not _whole(x) and _by_turns(x, low, high):
+        return
+    row = int(np.flatnonzero(outside)[0])
+    fits = _fitting(x, kind, low, high)
+    if not fits:
+        return
+    at = f"{table.path}: column {name!r}, {table.where(row)}: {x[row]:.6g} is far outside the model's range"
+    keys = " or ".join(_key(name, name, unit) for unit in fits)
+    own = "rad" if kind == "hinge" else "m"
+    raise UserError(
+        f"{at} [{low:g}, {high:g}], and values from {x.min():.6g} to {x.max():.6g} would fit as {' or '.join(fits)}; "
+        f"state one in a map (docs/logs.md): {keys}, or `unit: {own}` if they are in {own} all the same"
+    )
+
+
+def _many_turns(table: Table, name: str, x: Array) -> None:
+    """Two turns to and fro of a joint without a range: rare in rad, usual in degrees."""
+    if np.ptp(x) > 2.0 * TURN and abs(x[-1] - x[0]) < 0.5 * np.ptp(x) and np.abs(np.diff(x)).max() < np.pi:
+        text = f"{table.path}: column {name!r} goes to and fro by {np.ptp(x) / TURN:.3g} turns in rad"
+        warnings.warn(f"{text}; degrees would need {_key(name, name, 'deg')} in a map", stacklevel=5)
+
+
+def _whole(x: Array) -> bool:
+    return bool((x == np.round(x)).all())
+
+
+def _by_turns(x: Array, low: float, high: float) -> bool:
+    slack = 0.02 * (high - low)
+    return any(x.min() + TURN * k >= low - slack and x.max() + TURN * k <= high + slack for k in range(-16, 17))
+
+
+def _fitting(x: Array, kind: str, low: float, high: float) -> list[str]:
+    slack = 0.05 * (high - low)
+    found = []
+    scales = {"deg": DEGREE} if kind == "hinge" else {"mm": 1e-3, "cm": 1e-2}
+    for unit, scale in scales.items():
+        fits = x.min() * scale >= low - slack and x.max() * scale <= high + slack
+        wraps = unit == "deg" and x.min() >= -180.5 and x.max() <= 360.5 and np.abs(np.diff(x)).max() > 180.0
+        if fits or wraps:
+            found.append(unit)
+    if x.min() >= -0.5 and x.max() <= 100.5:
+        found.append(units.PERCENT)
+    if _whole(x) and kind == "hinge" and np.abs(x).max() > 200.0:
+        found.append(units.COUNTS)
+    return found
+
+
+def _by_target(table: Table, reading: str, target: str, columns: Mapping[str, Array]) -> None:
+    """A joint that follows its target with about 57 times its amplitude, or a 57th: one of the two is in degrees."""
+    q, c = columns[reading], columns[target]
+    if not (np.ptp(q) > 0 and np.ptp(c) > 0) or np.corrcoef(q, c)[0, 1] < ALIKE:
+        return
+    ratio = float(np.std(q) / np.std(c))
+    for name, factor in ((reading, ratio * DEGREE), (target, DEGREE / ratio)):
+        if 1.0 / RATIO < factor < RATIO:
+            text = f"{table.path}: {reading!r} follows {target!r} with {ratio:.4g} times its amplitude"
+            raise UserError(
+                f"{text}: {name!r} may be in degrees; state {_key(name, name, 'deg')} in a map, or `unit: rad` if not"
+            )
+
+
+__all__ = ["check_units"]

@@ -1,0 +1,162 @@
+"""Joint states that more than one publisher sent on one topic: never merged where their positions differ."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.importers.messages import FIELDS, Message
+from bayessim_mjx.logs.log import Array
+from bayessim_mjx.logs.signals import quantum
+
+LEAST = 5e-3  # rad or m, apart from which two values are two
+COUNTS = 20.0  # steps of an encoder, within which a value may flicker
+STEPS = 8.0  # usual steps from sample to sample, beyond which a value belongs to no smooth motion
+FEW = 5  # values off the motion from which another publisher is behind them
+
+
+@dataclass(frozen=True)
+class _Form:
+    """The features by which one publisher's messages differ from another's."""
+
+    publisher: str
+    frame: str
+    names: tuple[str, ...]
+    fields: tuple[str, ...]
+
+    @classmethod
+    def of(cls, message: Message) -> _Form:
+        body = message.body
+        frame = str(getattr(getattr(body, "header", None), "frame_id", "") or "")
+        filled = tuple(f for f in FIELDS if len(getattr(body, f)))
+        return cls(message.publisher, frame, tuple(map(str, body.name)), filled)
+
+    def sentence(self, number: int, count: int) -> str:
+        by = f" of {self.publisher}" if self.publisher.startswith("/") else ""
+        frame = f", frame {self.frame!r}" if self.frame else ""
+        return f"{number}: {count} messages{by} with {', '.join(self.fields)} of {', '.join(self.names)}{frame}"
+
+
+def of_one_publisher(
+    name: str, topic: str, messages: Sequence[Message], chosen: int | None, received: bool = False
+) -> list[Message]:
+    """The messages of joint states of one publisher, or of several that agree or have no joint in common.
+
+    Args:
+        name: of the recording; topic: of the messages.
+        chosen: number of the publisher, from 1, in the order of a refusal.
+        received: stamps are those of receipt.
+
+    Raises:
+        UserError: two publishers give different positions of a joint; names both, and how to choose.
+    """
+    forms: dict[_Form, list[Message]] = defaultdict(list)
+    for message in messages:
+        forms[_Form.of(message)].append(message)
+    ranked = sorted(forms.items(), key=lambda item: -len(item[1]))
+    if chosen is not None:
+        if not 1 <= chosen <= len(ranked):
+            raise UserError(f"{name}: --publisher {chosen}; allowed: 1 to {len(ranked)} on {topic}")
+        return ranked[chosen - 1][1]
+    why = (not received and _same_stamp(messages)) or _apart(ranked) or _two_tracks(messages)
+    if not why:
+        return list(messages)
+    told = "; ".join(form.sentence(i, len(each)) for i, (form, each) in enumerate(ranked, 1))
+    text = f"{name}: {topic} has more than one publisher: {why}"
+    if len(ranked) == 1:
+        text += "; their messages cannot be distinguished; allowed: a recording without the second publisher, another"
+        raise UserError(f"{text} topic by --states TOPIC, or --stamps received, if one publisher's stamps are coarse")
+    raise UserError(f"{text}; choose by --publisher N ({told}), or another topic by --states TOPIC")
+
+
+def _positions(message: Message) -> dict[str, float]:
+    pairs = zip(message.body.name, message.body.position, strict=False)
+    return {str(joint): float(x) for joint, x in pairs if np.isfinite(x)}
+
+
+def _same_stamp(messages: Sequence[Message]) -> str:
+    """Messages with one stamp that give a joint two positions."""
+    seen: dict[int, dict[str, float]] = {}
+    for message in messages:
+        own = _positions(message)
+        before = seen.setdefault(message.stamp, {})
+        for joint, x in own.items():
+            if joint in before and abs(before[joint] - x) > 1e-9:
+                return f"messages with the same stamp give {joint!r} the positions {before[joint]:.6g} and {x:.6g}"
+        before |= own
+    return ""
+
+
+def _track(messages: Iterable[Message], joint: str) -> tuple[Array, Array]:
+    """Stamps [s, from the first] and positions of one joint."""
+    pairs = [(m.stamp, p[joint]) for m in messages if joint in (p := _positions(m))]
+    pairs.sort()
+    time = np.array([t - pairs[0][0] for t, _ in pairs], float) * 1e-9 + pairs[0][0] % 10**15 * 1e-9
+    return time, np.array([x for _, x in pairs])
+
+
+def _apart(ranked: Sequence[tuple[_Form, Sequence[Message]]]) -> str:
+    """Publishers of other forms whose positions lie off those of the first, interleaved with it."""
+    for i, (first, many) in enumerate(ranked):
+        for second, few in ranked[i + 1 :]:
+            for joint in sorted(set(first.names) & set(second.names)):
+                found = _off(many, few, joint)
+                if found:
+                    return found
+    return ""
+
+
+def _off(many: Sequence[Message], few: Sequence[Message], joint: str) -> str:
+    if not any(joint in _positions(m) for m in many) or not any(joint in _positions(m) for m in few):
+        return ""
+    (time, x), (at, y) = _track(many, joint), _track(few, joint)
+    inside = (at > time[0]) & (at < time[-1])
+    if len(x) < 3 or not inside.any():
+        return ""
+    steps = np.abs(np.diff(x))
+    usual = max(LEAST, COUNTS * quantum(x), STEPS * float(np.median(steps)))
+    between = np.interp(at[inside], time, x)
+    after = np.clip(np.searchsorted(time, at[inside]) - 1, 0, len(steps) - 1)
+    near = np.max([steps[np.clip(after + k, 0, len(steps) - 1)] for k in (-1, 0, 1)], axis=0)  # a fast stretch
+    off = np.abs(y[inside] - between) > np.maximum(usual, 2.0 * near)
+    if off.sum() < min(3, len(off)):
+        return ""
+    row = int(np.flatnonzero(off)[0])
+    return f"between messages with {joint!r} near {between[row]:.6g} others have it at {y[inside][row]:.6g}"
+
+
+def _two_tracks(messages: Sequence[Message]) -> str:
+    """Values that leave the motion for one sample and come back, again and again."""
+    for joint in _positions(messages[0]) if messages else ():
+        _, x = _track(messages, joint)
+        if len(x) < 10:
+            continue
+        steps = np.abs(np.diff(x))
+        across = np.abs(x[2:] - x[:-2])
+        usual = max(LEAST, COUNTS * quantum(x), STEPS * float(np.median(across)))
+        out = (steps[:-1] > usual) & (steps[1:] > usual) & (across < 0.2 * np.minimum(steps[:-1], steps[1:]))
+        apart = x[1:-1][out]
+        if out.sum() >= FEW and np.median(np.abs(np.diff(apart))) < 0.2 * np.median(steps[:-1][out]):
+            return f"positions of {joint!r} jump to and fro, as from {x[:-2][out][0]:.6g} to {apart[0]:.6g} and back"
+        if out.sum() >= 0.5 * len(out):
+            return f"positions of {joint!r} jump to and fro at every sample"
+    return ""
+
+
+def several_senders(name: str, topics: Iterable[str], by_topic: Mapping[str, Sequence[Any]]) -> list[str]:
+    """Notes on topics of commands that several nodes sent to: a drive acts on all of them."""
+    out = []
+    for topic in topics:
+        senders = sorted({m.publisher for m in by_topic[topic]})
+        if len(senders) > 1:
+            text = f"{name}: {topic}: commands of {len(senders)} publishers are taken together"
+            out.append(f"{text}, as a drive gets them")
+    return out
+
+
+__all__ = ["of_one_publisher", "several_senders"]

@@ -1,0 +1,150 @@
+"""Time stamps that are numbers: in which unit they are, and rows that follow each other evenly behind coarse stamps."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs import units
+from bayessim_mjx.logs.log import Array
+from bayessim_mjx.logs.table import Table
+
+SINCE = (946684800.0, 4102444800.0)  # s since 1970: 2000 to 2100
+DAYS = (36526.0, 73050.0)  # the same in days since 1900, as spreadsheets count
+PERIODS = (1e-4, 1.0)  # s between rows of a log of a robot
+WINDOW = 7  # rows through which a parabola is put
+
+
+def seconds_of(raw: Array, table: Table, column: str) -> Array:
+    """Stamps [T] whose unit nobody stated, as seconds.
+
+    Stamps since 1970 in ms, us or ns, days of a spreadsheet, and a unit at the end of the column's name are taken where
+    no other reading has a period of `PERIODS`. All other stamps are seconds.
+
+    Raises:
+        UserError: two readings fit.
+    """
+    seen = raw[np.isfinite(raw)]
+    if len(seen) < 2:
+        return raw
+    steps = np.diff(seen)
+    step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    start = float(seen[0])
+    for unit in ("ms", "us", "ns"):
+        scale = units.TIMES[unit]
+        if SINCE[0] <= start * scale <= SINCE[1] and _period(step * scale):
+            _say(table, column, f"{unit} since 1970", unit)
+            return raw * scale
+    if DAYS[0] <= start <= DAYS[1] and step < 1.2e-5 and _period(step * units.TIMES["days"]):
+        _say(table, column, "days of a spreadsheet", "days")
+        return (raw - start) * units.TIMES["days"]
+    unit = "s" if column == "time" else units.of_name(column) or "s"
+    if unit not in units.TIMES:
+        return raw
+    if unit != "s":
+        return _named(raw, step, table, column, unit)
+    if step == 1.0 and (steps == np.floor(steps)).all() and _whole(table, column) and (steps > 0).all():
+        raise UserError(f"{_doubt(table, column, 'ms')}: whole numbers that grow by 1")
+    return raw
+
+
+def _period(step: float) -> bool:
+    return PERIODS[0] <= step <= PERIODS[1]
+
+
+def _say(table: Table, column: str, what: str, unit: str) -> None:
+    text = f"{table.path}: column {column!r} is read as {what}; `time: {{column: {column!r}, unit: {unit}}}` says so"
+    warnings.warn(text, stacklevel=7)
+
+
+def _doubt(table: Table, column: str, unit: str) -> str:
+    keys = f"`time: {{column: {column!r}, unit: {unit}}}` or `time: {{column: {column!r}, unit: s}}` in a map"
+    return f"{table.path}: column {column!r} may be in {unit} or in s; state {keys}"
+
+
+def _named(raw: Array, step: float, table: Table, column: str, unit: str) -> Array:
+    """The column's name bears a unit other than the second."""
+    scale = units.TIMES[unit]
+    if _period(step * scale) and not _period(step):
+        _say(table, column, f"{unit}, as its name says", unit)
+        return raw * scale
+    raise UserError(f"{_doubt(table, column, unit)}: its name says {unit}, and its median step is {step:.4g}")
+
+
+def _whole(table: Table, column: str) -> bool:
+    """Whether all fields are written as whole numbers."""
+    values = table.columns[column]
+    if isinstance(values, np.ndarray) and values.dtype.kind not in "US":
+        return values.dtype.kind in "iu"
+    return all(str(v).strip().lstrip("+-").isdigit() for v in values if str(v).strip())
+
+
+def even(raw: Array, rate: float, table: Table, column: str) -> Array:
+    """Times [T] of rows that follow each other at `rate` [1/s], from stamps that are too coarse or come too late.
+
+    Raises:
+        UserError: stamps with another rate, or with a gap.
+    """
+    seen = np.flatnonzero(np.isfinite(raw))
+    time = raw[seen[0]] + (np.arange(len(raw)) - seen[0]) / rate if len(seen) else raw.copy()
+    time = np.where(np.isfinite(raw), time, np.nan)
+    if len(seen) < 3:
+        return time
+    span, rows = float(raw[seen[-1]] - raw[seen[0]]), int(seen[-1] - seen[0])
+    grain = coarseness(raw[seen])
+    at = f"{table.path}: column {column!r}"
+    if span <= 0 or not (span - grain) * rate <= 1.02 * rows + 1 or not (span + grain) * rate >= 0.98 * rows - 1:
+        told = f"{rows / span:.6g} rows per second" if span > 0 else "no time between the first and the last row"
+        raise UserError(
+            f"{at}: its stamps give {told}, `rate: {rate:g}` of the map tells {rate:g}; allowed: their rate"
+        )
+    late = raw[seen] - time[seen]
+    jumps = np.abs(np.diff(late))
+    if jumps.max() > max(5.0 / rate, 1.5 * grain, 0.01):
+        row = int(seen[int(np.argmax(jumps)) + 1])
+        text = f"{at}, {table.where(row)}: the stamps jump by {jumps.max():.4g} s against `rate: {rate:g}` of the map"
+        raise UserError(f"{text}; allowed: rows without a gap, or `time: {column}` without a rate")
+    return time
+
+
+def coarseness(raw: Array) -> float:
+    """s between different stamps, where many rows share each; else 0."""
+    steps = np.diff(raw)
+    return float(np.median(steps[steps > 0])) if np.mean(steps == 0) > 0.3 and (steps > 0).any() else 0.0
+
+
+def roughness(time: Array, x: Array) -> float:
+    """Root mean square of what parabolas through `WINDOW` rows leave of x [T] at the times [T] of one clock.
+
+    Of two clocks for the same rows, the true one leaves less.
+    """
+    t, y = sliding_window_view(time, WINDOW), sliding_window_view(x, WINDOW)
+    chosen = np.linspace(0, len(t) - 1, min(len(t), 4000)).astype(int)
+    t, y = t[chosen], y[chosen]
+    t = (t - t[:, WINDOW // 2, None]) / np.maximum(np.ptp(t, axis=1), 1e-300)[:, None]
+    design = np.stack([np.ones_like(t), t, t**2], 2)
+    q, _ = np.linalg.qr(design)
+    left = y - (q @ (q.transpose(0, 2, 1) @ y[:, :, None]))[:, :, 0]
+    return float(np.sqrt(np.mean(left**2)))
+
+
+def better_clock(time: Array, rate: float, positions: Array) -> tuple[str, float]:
+    """(stamps or rate, ratio of what both leave): which clock the motion in positions [T, n] fits better.
+
+    Args:
+        time: [T] s, as stamped. rate: rows per second.
+    """
+    grid = time[0] + np.arange(len(time)) / rate
+    ratios = []
+    for x in positions.T:
+        by_stamps, by_rate = roughness(time, x), roughness(grid, x)
+        if np.ptp(x) > 0 and min(by_stamps, by_rate) > 0:
+            ratios.append(by_stamps / by_rate)
+    ratio = float(np.exp(np.mean(np.log(ratios)))) if ratios else 1.0
+    return ("rate", ratio) if ratio > 1 else ("stamps", 1.0 / ratio)
+
+
+__all__ = ["better_clock", "coarseness", "even", "roughness", "seconds_of"]

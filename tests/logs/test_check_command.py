@@ -1,0 +1,127 @@
+"""`bayessim-mjx logs check`: what it shows, the map that it writes, and what it says is missing."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from importing import error, model_of
+from log_files import ARM, HEADER, rows, write
+
+from bayessim_mjx import import_logs
+from bayessim_mjx.logs import read_logs
+from bayessim_mjx.logs.proposal import parts, propose
+
+MODEL = mujoco.MjModel.from_xml_string(ARM)
+
+
+def check(capsys: pytest.CaptureFixture, *argv: str | Path) -> tuple[int, str]:
+    code = import_logs.main(["check", *map(str, argv)])
+    out = capsys.readouterr()
+    assert not out.err, out.err
+    return code, out.out
+
+
+def logs_of(tmp_path: Path, table: np.ndarray, header: str, name: str = "run.csv") -> Path:
+    (tmp_path / "logs").mkdir(exist_ok=True)
+    write(tmp_path / "logs", table, header, name)
+    return tmp_path / "logs"
+
+
+def test_joints_names_give_a_map_and_missing_commands_are_said_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    folder = logs_of(tmp_path, rows()[:, [0, 3, 4]], "t,shoulder,elbow")
+    code, out = check(capsys, folder, "--model", model_of(tmp_path))
+    assert code == 2 and "qpos:shoulder" in out and "100 Hz" in out
+    assert out.splitlines()[-1].startswith("missing: commands: ctrl:m_shoulder, ctrl:m_elbow")
+    text = (folder / "map.yaml").read_text()
+    assert "time: t" in text and "elbow: elbow" in text and "# ctrl: {m_shoulder: COLUMN, m_elbow: COLUMN}" in text
+    before = text
+    code, out = check(capsys, folder, "--model", model_of(tmp_path))
+    assert code == 2 and "is written" not in out and (folder / "map.yaml").read_text() == before
+    (folder / "map.yaml").unlink()
+    with pytest.raises(Exception, match=r"`time: t`, `qpos: .*also missing, and needed: commands \(ctrl:m_shoulder"):
+        read_logs(folder, MODEL, partial=True)
+
+
+def test_a_spreadsheet_becomes_a_log_by_the_map_that_is_proposed(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    table = rows() * np.array([1000, 1, 1, 180 / np.pi, 180 / np.pi])
+    (tmp_path / "logs").mkdir()
+    names = "t [ms];ShoulderTorqueCommand;elbow_cmd;shoulder pos [\u00b0];elbow_actual_deg;note"
+    lines = [";".join(f"{x:.6f}".replace(".", ",") for x in row) + ";ok" for row in table]
+    (tmp_path / "logs" / "run.txt").write_text("\n".join(["Recorder 3", names, *lines]), encoding="utf-8-sig")
+    code, out = check(capsys, tmp_path / "logs", "--model", model_of(tmp_path))
+    assert code == 0, out
+    assert "unused: text" in out and "nothing is missing" in out and "unit" in out
+    (log,) = read_logs(tmp_path / "logs", MODEL)
+    np.testing.assert_allclose(log.time, rows()[:, 0], atol=1e-9)
+    np.testing.assert_allclose(np.c_[log.ctrl, log.qpos], rows()[:, 1:], atol=1e-6)
+
+
+def test_logs_of_the_librarys_own_form_need_no_map(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = logs_of(tmp_path, np.delete(rows(100), range(50, 70), axis=0), HEADER)
+    before = read_some(folder)
+    code, out = check(capsys, folder, "--model", model_of(tmp_path))
+    assert code == 0 and "1, longest 0.21 s" in out and "cut into 2" in out
+    assert (folder / "map.yaml").is_file() and read_some(folder) == before
+
+
+def read_some(folder: Path) -> list[float]:
+    with pytest.warns(UserWarning, match="gap"):
+        return [float(log.qpos.sum()) for log in read_logs(folder, MODEL)]
+
+
+def test_a_folder_that_is_read_only_gets_no_map(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = logs_of(tmp_path, rows()[:, [0, 3, 4]], "t,shoulder,elbow")
+    folder.chmod(0o555)
+    try:
+        _, out = check(capsys, folder, "--model", model_of(tmp_path))
+    finally:
+        folder.chmod(0o755)
+    assert "cannot be written" in out and "time: t" in out and not (folder / "map.yaml").exists()
+
+
+def test_what_cannot_be_checked_says_the_way_on(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert "no such file" in error(capsys, "check", tmp_path / "nowhere")
+    assert "no log; it holds nothing" in error(capsys, "check", tmp_path)
+    (tmp_path / "run.mcap").touch()
+    assert "logs from-mcap" in error(capsys, "check", tmp_path)
+    folder = logs_of(tmp_path, rows(), "t,ua,ub,qa,qb")
+    code, out = check(capsys, folder)
+    assert code == 2 and "missing: --model FILE" in out and "100 Hz" in out
+    (folder / "map.yaml").unlink()
+    code, out = check(capsys, folder, "--model", model_of(tmp_path))
+    assert code == 2 and "ctrl:m_shoulder" in out and "positions: qpos:shoulder, qpos:elbow" in out
+
+
+@pytest.mark.parametrize(
+    ("column", "channel"),
+    [
+        ("shoulder", ("qpos", "shoulder")),
+        ("elbow.pos", ("qpos", "elbow")),
+        ("dq_elbow", ("qvel", "elbow")),
+        ("ElbowVelocity", ("qvel", "elbow")),
+        ("target_elbow", ("ctrl", "m_elbow")),
+        ("m_elbow", ("ctrl", "m_elbow")),
+        ("m_elbow.current_mA", ("streams", "effort:m_elbow")),
+        ("elbow_torque", ("streams", "effort:m_elbow")),
+        ("wrist", None),
+        ("elbows", None),
+    ],
+)
+def test_names_of_columns_suggest_channels(column: str, channel: tuple[str, str] | None) -> None:
+    found = propose([column], MODEL).blocks()
+    assert [(kind, name) for kind, block in found.items() for name in block] == ([channel] if channel else [])
+
+
+def test_two_columns_for_one_channel_are_asked_about() -> None:
+    found = propose(["time", "elbow_pos", "elbow_position", "stamp"], MODEL)
+    assert not found.qpos and any("elbow_pos or elbow_position" in question for question in found.questions)
+    assert any("time or stamp" in question for question in found.questions)
+
+
+def test_words_of_a_name_come_without_its_unit() -> None:
+    assert parts("shoulderPos_deg") == ("shoulder", "pos")
+    assert parts("angle A [\u00b0]") == ("angle", "a")
+    assert parts("leg2HipPos") == ("leg", "2", "hip", "pos")
