@@ -15,7 +15,7 @@ from bayessim_mjx.diagnosis.selection.search_state import log_prior
 
 @dataclass(frozen=True)
 class Relevance:
-    """How much an effect has to change to be relevant, however significant it is.
+    """How much an effect has to change to be relevant, however significant (docs/decisions/relevance_and_odds.md).
 
     Attributes:
         share: of the squared gap that the known parameters leave; laws of two simulators differ by as much.
