@@ -26,7 +26,7 @@ Shifted = Callable[[float], Windows]  # s -> the windows with commands that act 
 
 @dataclass(frozen=True)
 class Rules:
-    """How a shift is estimated, and when it is told. Chosen on the shifts of its tests; error rates not counted."""
+    """How a shift is estimated, and when it is reported. Chosen on the shifts of its tests; error rates not counted."""
 
     rounds: int = 3  # Newton steps with the first one's derivatives
     nudge: float = 0.1  # control steps, of the shift for its finite difference

@@ -15,7 +15,7 @@ from bayessim_mjx.logs.log import Array, Log
 
 @dataclass(frozen=True)
 class Limits:
-    """When a drive does what it is told. Error rates: benchmarks/records/first_look.json."""
+    """When a drive follows its command. Error rates: benchmarks/records/first_look.json."""
 
     scale: float = 0.03
     left: float = 0.02  # of the effort, root mean square

@@ -72,7 +72,7 @@ class Relation:
 
     @property
     def lag(self) -> float:
-        """s by which the motion follows the effort, where that is worth a word; else 0."""
+        """s by which the motion follows the effort, where that is reported; else 0."""
         return self.late.seconds if self.gain >= LIMITS.gain else 0.0
 
     @property

@@ -122,7 +122,7 @@ def noise_of(logs: Sequence[Log], raw: Sequence[Log], use_qvel: bool) -> tuple[A
     raw: the logs before they were resampled: a spline shows values that no sensor did.
 
     Raises:
-        UserError: no channel's noise is told.
+        UserError: no channel's noise is known.
     """
     dofs = noise_of_positions(raw)
     rate, moved = _pooled([log.sigma_qvel for log in logs], [noise_known(log, "qvel") for log in raw])

@@ -35,7 +35,7 @@ from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
 from bayessim_mjx.logs.log import Channels
 
-TOLD = 0.25  # of the time, from which on it is told that this was gone before the search
+TOLD = 0.25  # of the time, from which on a sentence says that this was gone before the search
 PACKAGES = ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")  # what the result depends on
 
 

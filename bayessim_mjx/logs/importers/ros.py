@@ -91,7 +91,7 @@ def _command_topics(name: str, topics: _Topics, choice: Choice) -> Mapping[str, 
             raise UserError(f"{name}: --commands {absent[0]}: no such topic; {topics.sentence()}")
         return choice.commands
     found = [*topics.of_kind(*COMMANDS), *(t for t in topics.of_kind(STATE) if "command" in t)]
-    found = found or topics.of_kind(CONTROLLER)  # where nothing else commands, a controller says what it was told
+    found = found or topics.of_kind(CONTROLLER)  # where nothing else commands, a controller reports its reference
     if not found:
         raise UserError(f"{name}: no topic of commands; {topics.sentence()}; allowed: --commands TOPIC")
     return {topic: () for topic in found}
