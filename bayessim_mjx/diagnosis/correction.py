@@ -177,8 +177,8 @@ def calibrated_of(diagnosis: Found, space: ParameterSpace) -> ParameterSpace:
 
 
 def _calibrated(p: Parameter, found: dict | None) -> Parameter:
-    told = found or {}
-    mean, sd = _number(told.get("simulated", told.get("mean"))), _number(told.get("sd"))
+    estimate = found or {}
+    mean, sd = _number(estimate.get("simulated", estimate.get("mean"))), _number(estimate.get("sd"))
     if math.isnan(mean):
         return p
     wide = dataclasses.replace(p, low=min(p.low, mean), high=max(p.high, mean))

@@ -24,7 +24,7 @@ ACCURACY = 0.07  # share of the stated value
 SURE = 2.0
 WORST = 0.3  # a data sheet that is less accurate than this is another robot's
 # What drives have that models leave out or guess: where inertia, damping and friction are all larger than modelled,
-# one number of a gain takes their place, and one by one none of them does.
+# one number of a gain takes their place, and one by one none of them does. Not counted: docs/decisions/drive_laws.md
 DRIVES = ("coulomb_friction", "viscous_friction", "armature")
 
 

@@ -1,4 +1,4 @@
-"""All that a diagnosis computed, before it is put into words, and who is told of it while it runs."""
+"""All that a diagnosis computed, before it is put into words, and who observes it while it runs."""
 
 from __future__ import annotations
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-# Root mean square residual, in noise standard deviations, up to which a model is said to be at the noise. Of checks
-# that named parameters only, 2 of 183 with nothing hidden leave more, and 70 of 160 others. It decides words, and
-# whether the gap is located; verdicts rest on `tried.FLOOR` and `verdict.LIMITS`, in the same unit.
+# Root mean square residual, in noise standard deviations, up to which a model is at the noise. It decides words, and
+# whether the gap is located; verdicts rest on `search_state.FLOOR` and `verdict.LIMITS`, in the same unit. Counted:
+# docs/decisions/at_noise.md
 AT_NOISE = 1.15
 
 

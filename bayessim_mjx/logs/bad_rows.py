@@ -60,12 +60,12 @@ def _not_after(time: Array, bad: Iterable[int]) -> list[int]:
 def _tell(
     table: Table, bad: Mapping[int, str], unreadable: Mapping[int, str], missing: int, policy: str, rows: int
 ) -> None:
-    told = []
+    texts = []
     if bad:
         first = min(bad)
-        told += [f"{len(bad)} of {rows} rows ({percent(len(bad) / rows)}) left out"]
-        told += [f"first {table.where(first)}: {bad[first]}"]
+        texts += [f"{len(bad)} of {rows} rows ({percent(len(bad) / rows)}) left out"]
+        texts += [f"first {table.where(first)}: {bad[first]}"]
     if missing:
         first = min(set(unreadable) - set(bad))
-        told += [f"fields of {missing} row(s) count as missing, first {table.where(first)}: {unreadable[first]}"]
-    warnings.warn(f"{table.path}: bad_rows: {policy}: {'; '.join(told)}", stacklevel=4)
+        texts += [f"fields of {missing} row(s) count as missing, first {table.where(first)}: {unreadable[first]}"]
+    warnings.warn(f"{table.path}: bad_rows: {policy}: {'; '.join(texts)}", stacklevel=4)

@@ -97,9 +97,9 @@ def even(raw: Array, rate: float, table: Table, column: str) -> Array:
     grain = coarseness(raw[seen])
     at = f"{table.path}: column {column!r}"
     if span <= 0 or not (span - grain) * rate <= 1.02 * rows + 1 or not (span + grain) * rate >= 0.98 * rows - 1:
-        told = f"{rows / span:.6g} rows per second" if span > 0 else "no time between the first and the last row"
+        found = f"{rows / span:.6g} rows per second" if span > 0 else "no time between the first and the last row"
         raise UserError(
-            f"{at}: its stamps give {told}, `rate: {rate:g}` of the map tells {rate:g}; allowed: their rate"
+            f"{at}: its stamps give {found}, `rate: {rate:g}` of the map tells {rate:g}; allowed: their rate"
         )
     late = raw[seen] - time[seen]
     jumps = np.abs(np.diff(late))

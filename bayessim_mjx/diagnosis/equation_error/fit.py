@@ -234,5 +234,5 @@ def score(sums: Sums, terms: Sequence[Term], start: Array | None = None) -> Arra
 
 def evidence(sums: Sums, found: Fit) -> float:
     """Log density of all efforts and priors at the fit: what ranks terms before any part is held out."""
-    told = np.where(used(sums), sums.rows.sum(0) * np.log(found.variance), 0.0)
-    return -0.5 * float(np.sum(told)) - found.penalty
+    density = np.where(used(sums), sums.rows.sum(0) * np.log(found.variance), 0.0)
+    return -0.5 * float(np.sum(density)) - found.penalty

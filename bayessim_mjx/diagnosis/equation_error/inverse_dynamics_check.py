@@ -105,7 +105,7 @@ class Look:
     explained: float = float("nan")
     shifts: tuple[Shift, ...] = ()
     vetoes: Mapping[str, str] = field(default_factory=dict)
-    told: Told | None = None
+    identifiability: Told | None = None
     seconds: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class Look:
             "channels": [vars(c) for c in self.channels], "joints": [vars(j) for j in self.joints], "unit": self.unit,
             "proposals": rows, "explained": self.explained, "shifts": [vars(s) for s in self.shifts],
             "contradicted": dict(self.vetoes), "seconds": self.seconds,
-            "inertial": vars(self.told) if self.told else {},
+            "inertial": vars(self.identifiability) if self.identifiability else {},
         }  # fmt: skip
 
 

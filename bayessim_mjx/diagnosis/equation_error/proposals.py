@@ -37,31 +37,31 @@ class Proposals:
 
 
 def checked(
-    logs: Sequence[Log], robot: Robot, dt: float, told: list[str], say: Callable[[Look], None]
+    logs: Sequence[Log], robot: Robot, dt: float, notes: list[str], say: Callable[[Look], None]
 ) -> tuple[gate.Gate, Look]:
     """The gate, after the look, which takes less time and is said at once; again where the gate refuses more logs."""
     sound = [log for log in logs if not gate.unusable(log, dt)]
-    seen = looked(sound, robot, told)
+    seen = looked(sound, robot, notes)
     say(seen)
     found = gate.check(logs, robot.mj_model, dt)
     if 0 < len(found.usable) < len(sound):
-        seen = looked(found.usable, robot, told)
+        seen = looked(found.usable, robot, notes)
         say(seen)
     return found, seen
 
 
-def looked(logs: Sequence[Log], robot: Robot, told: list[str]) -> Look:
+def looked(logs: Sequence[Log], robot: Robot, notes: list[str]) -> Look:
     """The look before any simulation; a failure costs the race its leads, not the diagnosis, and is `told`."""
     lost = sorted({name for log in logs for name in log.lost})
     if lost:
         need = f"they need the motion of all joints, and {', '.join(lost)} was not measured"
         text = f"checks and proposals before any simulation are left out: {need}"
-        told += [text] if text not in told else []  # the gate may ask for a second look
+        notes += [text] if text not in notes else []  # the gate may ask for a second look
         return Look()
     try:
         return check(logs, robot.mj_model, _deviations(robot), robot.rating)
     except Exception as error:
-        told.append(f"equation errors: not available ({type(error).__name__}: {error})")
+        notes.append(f"equation errors: not available ({type(error).__name__}: {error})")
         return Look()
 
 

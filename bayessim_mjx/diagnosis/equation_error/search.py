@@ -262,10 +262,10 @@ def _elsewhere(sums: Sums, known: Sequence[Term], offered: Sequence[Term], found
 
 def _unlike(channels: Sequence[Channel]) -> str:
     """Two drives whose efforts are different shares of what was commanded; or nothing."""
-    told = sorted((c for c in channels if c.told and not c.echo), key=lambda c: c.scale)
-    if len(told) < 2 or all(c.off == 1.0 for c in told):
+    known = sorted((c for c in channels if c.identified and not c.echo), key=lambda c: c.scale)
+    if len(known) < 2 or all(c.off == 1.0 for c in known):
         return ""
-    low, high = told[0], told[-1]
+    low, high = known[0], known[-1]
     if high.scale - low.scale < CRITERIA.apart + 3.0 * (low.deviation + high.deviation):
         return ""
     return f"{low.scale:.2g} of the command at {low.actuator}, {high.scale:.2g} at {high.actuator}"

@@ -36,7 +36,7 @@ AMOUNTS = np.linspace(0.0, 1.0, 101)[1:]  # of an effect, shares of the largest 
 class Limits:
     """Shares of what an effect does, squared and in noises, that refitting other parameters hides.
 
-    Rules of thumb: how often a hidden effect is told has not been counted.
+    Rules of thumb: how often a hidden effect is reported has not been counted.
 
     Attributes:
         hidden: at every starting point beside the answer, or more.

@@ -164,8 +164,8 @@ class Search:
         count = [0] * len(sizes)
         for plan in sorted(plans, key=lambda p: -p.nats):
             size = min(len(plan.columns), len(sizes)) - 1
-            told = plan.nats > top - EFFORT.margin or count[size] < least
-            if told and self._new(plan.key) and plan.key not in out and count[size] < sizes[size]:
+            promising = plan.nats > top - EFFORT.margin or count[size] < least
+            if promising and self._new(plan.key) and plan.key not in out and count[size] < sizes[size]:
                 out[plan.key] = plan
                 count[size] += 1
         return list(out.values())

@@ -15,7 +15,7 @@ from bayessim_mjx.diagnosis.selection.search_state import log_prior
 
 @dataclass(frozen=True)
 class Relevance:
-    """How much an effect has to change to be relevant, however significant it is.
+    """How much an effect has to change to be relevant, however significant (docs/decisions/relevance_and_odds.md).
 
     Attributes:
         share: of the squared gap that the known parameters leave; laws of two simulators differ by as much.
@@ -79,7 +79,7 @@ class Weighed:
         best = max(self.sets.values())
         return list(dict.fromkeys([self.answer, *(k for k, w in self.sets.items() if w * ODDS.strong >= best)]))
 
-    def told(self) -> list[dict[str, Any]]:
+    def to_dicts(self) -> list[dict[str, Any]]:
         """The sets with 99.9 % of the probability, and the known parameters alone, for JSON."""
         kept, whole = [], 0.0
         for key, weight in self.weight.items():

@@ -313,8 +313,8 @@ def reason(scorer: Scorer, chosen: Scored | None, labels: Sequence[str], contest
     if len(labels) == 1:
         index, variance = scorer.loosest(0)
         c, before = scorer.models[0].fit.coordinates[index], math.sqrt(variance)
-        told = c.name, before, before * math.exp(-chosen.evidence), c.unit
-        return phrases.sharpens(action, *told) if useful else phrases.sharpens_little(chosen.name, *told)
+        change = c.name, before, before * math.exp(-chosen.evidence), c.unit
+        return phrases.sharpens(action, *change) if useful else phrases.sharpens_little(chosen.name, *change)
     if not useful:
         return phrases.separates_nobody(labels, chosen.name, chosen.evidence, instead(scorer.models))
     return phrases.tells_apart(action, labels, chosen.evidence, contested)

@@ -26,7 +26,7 @@ Shifted = Callable[[float], Windows]  # s -> the windows with commands that act 
 
 @dataclass(frozen=True)
 class Rules:
-    """How a shift is estimated, and when it is told. Chosen on the shifts of its tests; error rates not counted."""
+    """How a shift is estimated, and when it is reported. Chosen on the shifts of its tests; error rates not counted."""
 
     rounds: int = 3  # Newton steps with the first one's derivatives
     nudge: float = 0.1  # control steps, of the shift for its finite difference
@@ -75,8 +75,8 @@ class Shift:
     def certain(self) -> bool:
         """Whether nothing else that is known would do as well."""
         steps, least = RULES.least_late
-        told = abs(self.late) > max(SURE * self.error, steps * self.step, least) and self.seen > RULES.seen
-        return told and self.explains > RULES.explains and self.apart < RULES.alike
+        significant = abs(self.late) > max(SURE * self.error, steps * self.step, least) and self.seen > RULES.seen
+        return significant and self.explains > RULES.explains and self.apart < RULES.alike
 
     @property
     def likely(self) -> bool:
@@ -89,7 +89,7 @@ class Shift:
         """s by which commands are moved: what is certainly a fault of the log; 0 or less."""
         return min(self.late, 0.0) if self.certain else 0.0
 
-    def told(self, period: float) -> list[str]:
+    def notes(self, period: float) -> list[str]:
         """What the user is told; period: s between rows of the log."""
         return [self.sentence(period)] if self.certain else [self.hint()] if self.likely else []
 

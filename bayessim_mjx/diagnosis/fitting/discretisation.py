@@ -126,8 +126,8 @@ class Discretisation:
 
     def _remedy(self, noises: float, simulated: bool) -> str:
         halvings = int(np.ceil(np.log2(noises / RULES.worth)))
-        told = not simulated and halvings <= RULES.shorter
-        other = f"a step of {1e3 * self.timestep / 2**halvings:.2g} ms" if told else "a shorter step"
+        few = not simulated and halvings <= RULES.shorter
+        other = f"a step of {1e3 * self.timestep / 2**halvings:.2g} ms" if few else "a shorter step"
         text = f"{other}, or the integrator RK4 where nothing is in contact, reduces it"
         if self.factor > 1:
             text += f"; the diagnosis simulates at {1e3 * self.timestep / self.factor:.3g} ms"

@@ -24,7 +24,7 @@ from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
-# (robot's physics, first=coarsest stable factor, cheaper=see `Errors`) -> (the windows, what the time step is worth)
+# (robot's physics, first=coarsest stable factor, cheaper=see `Errors`) -> (the windows, the error of the time step)
 Measured = Callable[..., tuple[Any, Discretisation]]
 STAGES = 4  # of Runge and Kutta's method, each as dear as a step
 TOO_LONG = "the model's time step shows beside the noise, and in the time given nothing finer can be searched with"
@@ -70,7 +70,7 @@ class Step:
         return _integrated(robot, self.integrator)
 
     def sentences(self) -> list[str]:
-        """What the user is told before anything is fitted."""
+        """Sentences for the user before anything is fitted."""
         if not self.joint:
             return []
         own, finer = 1e3 * self.timestep, 1e3 * self.timestep / self.factor
@@ -102,7 +102,7 @@ class Choice:
 
     Attributes:
         robot: with the integrator of the diagnosis; stable: its coarsest stable step.
-        cuts, worth: the windows, and what the time step is worth in them.
+        cuts, worth: the windows, and the error of the time step in them.
         better: told where the integrator was changed for its accuracy.
     """
 
@@ -113,7 +113,7 @@ class Choice:
     better: tuple[str, ...] = ()
 
     def said(self) -> list[str]:
-        """What the user is told before anything is fitted."""
+        """Sentences for the user before anything is fitted."""
         return [*self.stable.sentences(), *self.better, *self.worth.beyond()]
 
     def warnings(self) -> list[str]:

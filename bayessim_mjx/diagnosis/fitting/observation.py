@@ -44,7 +44,7 @@ class Rules:
     shares: tuple[float, ...] = (0.003, 0.03, 0.3)
     passes: int = 2
     second: float = 0.5
-    told: float = 0.5
+    known: float = 0.5
     most: float = 0.8
     least: float = 1e-6
 
@@ -264,7 +264,7 @@ def _demand(ways: Sequence[tuple[Log, Way]], model: mujoco.MjModel) -> None:
     log = ways[0][0]
     nv = model.nv
     known = np.min([way.known for _, way in ways], axis=0)
-    names = [n for i, n in enumerate(log.channels.qvel) if known[nv + i] > RULES.told]
+    names = [n for i, n in enumerate(log.channels.qvel) if known[nv + i] > RULES.known]
     if names:
         given = [f"qpos:{n}" for n in log.channels.qpos if f"qpos:{n}" not in log.absent]
         given += [f"qvel:{n}" for n, s in zip(log.channels.qvel, log.seen_speeds, strict=True) if s]

@@ -13,8 +13,8 @@ from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.fitting.simulable import AXIAL
 from bayessim_mjx.logs.log import Log
 
-# Of a joint's travel in the logs and of its range, the larger: as near as the motion has to come. A choice: windows are
-# short, and simulated motion that errs by so much is far from the logs whatever the limit does.
+# Of a joint's travel in the logs and of its range, the larger: as near as the motion has to come
+# (docs/decisions/unreached_limits.md).
 NEAR_TRAVEL, NEAR_RANGE = 0.25, 0.05
 # Iterations of Newton's solver and of its line search. Dry friction alone is solved to single precision by 4 and 6 (six
 # joints, half a second: the same to 1e-7 rad as by 100 and 50, at half the time); worlds in one call wait for the last.

@@ -264,8 +264,8 @@ def groups_of(logs: Sequence[Log], key: str | None = None) -> tuple[list[int], t
     if key and not any(labels):
         have = ", ".join(sorted({k for log in logs for k in log.metadata})) or "no keys"
         raise UserError(f"--group {key}: no log's metadata has this key; there are: {have}")
-    told = len(set(labels)) > 1  # the same condition everywhere cannot be held out
-    labels = [label if label and told else file for label, file in zip(labels, _files(logs), strict=True)]
+    several = len(set(labels)) > 1  # the same condition everywhere cannot be held out
+    labels = [label if label and several else file for label, file in zip(labels, _files(logs), strict=True)]
     names = tuple(dict.fromkeys(labels))
     return [names.index(label) for label in labels], names
 

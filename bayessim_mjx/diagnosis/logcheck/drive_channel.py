@@ -15,7 +15,7 @@ from bayessim_mjx.logs.log import Array, Log
 
 @dataclass(frozen=True)
 class Limits:
-    """When a drive does what it is told. Error rates: benchmarks/records/first_look.json."""
+    """When a drive follows its command. Error rates: benchmarks/records/first_look.json."""
 
     scale: float = 0.03
     left: float = 0.02  # of the effort, root mean square
@@ -66,7 +66,7 @@ class Channel:
         return self.left < LIMITS.left and self.peak < LIMITS.peak and not self.echo
 
     @property
-    def told(self) -> bool:
+    def identified(self) -> bool:
         """Whether the log tells what the drive does."""
         return max(self.noise, LIMITS.terms * self.cancels) < LIMITS.hidden
 
@@ -74,13 +74,13 @@ class Channel:
     def off(self) -> float:
         """The scale where it is surely not 1, else 1."""
         sure = LIMITS.scale + 3.0 * self.deviation + 2.0 * self.noise**2 + LIMITS.terms * self.cancels
-        return self.scale if abs(self.scale - 1.0) > sure and self.told and not self.echo else 1.0
+        return self.scale if abs(self.scale - 1.0) > sure and self.identified and not self.echo else 1.0
 
     @property
     def shifted(self) -> float:
         """The constant where it is surely not 0, else 0."""
         sure = (LIMITS.constant + self.left / 5.0) * self.size
-        return self.constant if abs(self.constant) > sure and self.told and not self.echo else 0.0
+        return self.constant if abs(self.constant) > sure and self.identified and not self.echo else 0.0
 
 
 def channels_of(logs: Sequence[Log], model: mujoco.MjModel, unit: bool) -> tuple[Channel, ...]:
@@ -125,18 +125,18 @@ class _Pair:
 
 def _pairs(log: Log, model: mujoco.MjModel, own: Sequence[int]) -> list[_Pair]:
     moved = motion(log, model)
-    told, middle, noise = commanded(log, model), commanded(centred(log), model), _noise(log, model)
+    commands, middle, noise = commanded(log, model), commanded(centred(log), model), _noise(log, model)
     still = commanded(replace(log, qvel=0.0 * log.qvel), model)
     out = []
     for i in own:
         effort = measured(log, i)
         assert effort is not None
         rows = [np.maximum(np.arange(len(log)) - k, 0) for k in range(ROWS)]
-        each = [np.stack([filtered(x[r, i], log, moved)[moved.free] for r in rows]) for x in (told, middle)]
+        each = [np.stack([filtered(x[r, i], log, moved)[moved.free] for r in rows]) for x in (commands, middle)]
         smooth = filtered(effort, log, moved)[moved.free]
         noisy = filtered(noise[:, i], log, moved)[moved.free]
         terms = filtered(still[:, i], log, moved)[moved.free]
-        out.append(_Pair(smooth, each[0], each[1], np.stack([told[:, i], effort]), noisy, terms, moved.share))
+        out.append(_Pair(smooth, each[0], each[1], np.stack([commands[:, i], effort]), noisy, terms, moved.share))
     return out
 
 
@@ -154,14 +154,14 @@ def _better(name: str, pairs: Sequence[_Pair], period: float) -> Channel:
     return min(held, middle, key=lambda c: c.left)
 
 
-def _channel(name: str, pairs: Sequence[_Pair], told: Sequence[Array], period: float, behind: float) -> Channel:
+def _channel(name: str, pairs: Sequence[_Pair], efforts: Sequence[Array], period: float, behind: float) -> Channel:
     """Least squares of the effort on the commands of this row and those before, and a constant.
 
     Args:
         behind: rows that a command acts later on average than it stands in the log, which is no lateness.
     """
     y = np.concatenate([np.sqrt(p.share) * p.effort for p in pairs])
-    x = np.concatenate([np.sqrt(p.share) * z for p, z in zip(pairs, told, strict=True)], axis=1)
+    x = np.concatenate([np.sqrt(p.share) * z for p, z in zip(pairs, efforts, strict=True)], axis=1)
     one = np.concatenate([np.full(len(p.effort), np.sqrt(p.share)) for p in pairs])
     X = np.stack([*x, one], 1)
     c, *_ = np.linalg.lstsq(X, y, rcond=1e-6)

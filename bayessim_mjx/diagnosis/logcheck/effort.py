@@ -72,7 +72,7 @@ class Relation:
 
     @property
     def lag(self) -> float:
-        """s by which the motion follows the effort, where that is worth a word; else 0."""
+        """s by which the motion follows the effort, where that is reported; else 0."""
         return self.late.seconds if self.gain >= LIMITS.gain else 0.0
 
     @property
@@ -126,8 +126,8 @@ def _relation(
     )
     if not laden:
         other = _relation(log, mj_model, effort, pictures, laden=True)
-        told = other.explained or 0.0
-        if told >= LIMITS.doubtful and not other.refused and 1.0 - told < LIMITS.loaded * (1.0 - share):
+        explained = other.explained or 0.0
+        if explained >= LIMITS.doubtful and not other.refused and 1.0 - explained < LIMITS.loaded * (1.0 - share):
             return other
     return replace(relation, mend=mend, certain=certain)
 

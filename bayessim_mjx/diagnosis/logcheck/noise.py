@@ -20,7 +20,7 @@ PRECISE = 5e-7  # s: times a joint's speed, as precise as positions are taken to
 ONCE = "no run was repeated: these logs do not separate chance from an error of the model"
 
 
-def told(log: Log, stream: str = "qpos") -> NDArray[np.bool_]:
+def noise_known(log: Log, stream: str = "qpos") -> NDArray[np.bool_]:
     """`[nv]`: whether a log tells the noise of its positions, or of its velocities (`stream` qvel).
 
     A channel that shows fewer than `LEVELS` values tells none: it may have any resolution. What is stated wins: `sigma`
@@ -122,10 +122,10 @@ def noise_of(logs: Sequence[Log], raw: Sequence[Log], use_qvel: bool) -> tuple[A
     raw: the logs before they were resampled: a spline shows values that no sensor did.
 
     Raises:
-        UserError: no channel's noise is told.
+        UserError: no channel's noise is known.
     """
     dofs = noise_of_positions(raw)
-    rate, moved = _pooled([log.sigma_qvel for log in logs], [told(log, "qvel") for log in raw])
+    rate, moved = _pooled([log.sigma_qvel for log in logs], [noise_known(log, "qvel") for log in raw])
     motion = np.sqrt(np.mean([np.mean(log.qvel**2, axis=0) for log in logs], axis=0))
     known, precise = np.isfinite(dofs), np.maximum(PRECISE * motion, 1e-14)
     sigma_q = np.maximum(dofs, precise)
@@ -152,7 +152,7 @@ def noise_of_positions(logs: Sequence[Log]) -> Array:
 
     logs: as recorded.
     """
-    pooled, known = _pooled([log.sigma_dofs for log in logs], [told(log) for log in logs])
+    pooled, known = _pooled([log.sigma_dofs for log in logs], [noise_known(log) for log in logs])
     return np.where(known, pooled, np.inf)
 
 

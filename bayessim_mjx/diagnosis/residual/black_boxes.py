@@ -170,7 +170,7 @@ def _trained(
 class Rules:
     """How large a formula may be.
 
-    A term is worth it where it explains more than chance does: log(candidates) + log(numbers) / 2 nats (the extended
+    A term stays if it explains more than chance does: log(candidates) + log(numbers) / 2 nats (the extended
     Bayesian criterion of Chen and Chen, 2008), in misfits as large as those that are left.
     """
 

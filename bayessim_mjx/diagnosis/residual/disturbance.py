@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sizes:
-    """Pulses by which the missing force is told."""
+    """Pulses that represent the missing force."""
 
     pulse: float = 0.03  # of the robot's force scale: finite differences
     # about so many forces per window unless told otherwise; each costs one simulation of all windows

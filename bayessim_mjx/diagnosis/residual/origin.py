@@ -41,7 +41,7 @@ class Rules:
     least: float = 0.3
     rows: int = 16000
     steps: int = 100
-    told: float = 3.0
+    decisive: float = 3.0
     errors: float = 1.0
 
 
@@ -65,7 +65,7 @@ class Origin:
     @property
     def of_sensors(self) -> bool:
         """Whether nothing speaks for forces."""
-        return self.force < self.sensor + RULES.told or self.deviate < RULES.errors
+        return self.force < self.sensor + RULES.decisive or self.deviate < RULES.errors
 
 
 def origin(
@@ -103,7 +103,7 @@ def origin(
     at = {kind: int(np.argmax([nats for nats, _ in of])) for kind, of in found.items()}
     (sensor, by_sensor), (force, by_force) = (found[kind][at[kind]] for kind in ("sensor", "force"))
     deviate = statistics.normal_deviate(by_force - by_sensor, np.arange(len(own)))
-    return Origin(sensor, force, deviate, RULES.memories[at["sensor"]] if sensor > RULES.told else 0.0)
+    return Origin(sensor, force, deviate, RULES.memories[at["sensor"]] if sensor > RULES.decisive else 0.0)
 
 
 def _white(r: Array, rate: Array) -> tuple[Array, Array]:

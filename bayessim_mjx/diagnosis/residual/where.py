@@ -29,7 +29,7 @@ class Rules:
     """When a place is worth telling."""
 
     worth: float = 0.1  # share of the gap that makes a joint worth a sentence
-    told: float = 0.15  # share of a joint's missing power that a region must explain to be told
+    least_share: float = 0.15  # share of a joint's missing power that a region must explain to be told
 
 
 RULES = Rules()
@@ -124,7 +124,7 @@ def _maps(nodes: list[Nodes], without: Array, rng: np.random.Generator) -> list[
 
 
 def _told(found: Tree) -> tuple[Leaf, ...]:
-    return tuple([leaf for leaf in found.leaves if leaf.share > RULES.told and found.r2 > RULES.told][:3])
+    return tuple([leaf for leaf in found.leaves if leaf.share > RULES.least_share and found.r2 > RULES.least_share][:3])
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class Fingerprint:
     weight: dict[str, float]
 
     @property
-    def told(self) -> dict[str, Number]:
+    def relevant(self) -> dict[str, Number]:
         """The numbers that matter: clear, and not small."""
         return {k: n for k, n in self.numbers.items() if n.clear and self.weight[k] > LIMITS.small}
 

@@ -15,7 +15,7 @@ from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.models import Key, Model
 from bayessim_mjx.diagnosis.selection.screen import Screened, Secants
 
-FLOOR = 1.3  # noise standard deviations (rms) up to which an error needs no explanation; a rule of thumb
+FLOOR = 1.3  # noise standard deviations (rms) up to which an error needs no explanation; docs/decisions/at_noise.md
 EXPECTED = 1.0  # prior number of effects that a simulator lacks; no effect is as likely as one
 LEFT = 1.0  # mean square of start states, in their variances, from which fits with contacts begin at measured ones
 ASTRAY = 10.0  # noise standard deviations (rms) from which on a fit's derivatives change at every step

@@ -35,7 +35,7 @@ from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
 from bayessim_mjx.logs.log import Channels
 
-TOLD = 0.25  # of the time, from which on it is told that this was gone before the search
+TOLD = 0.25  # of the time, from which on a sentence says that this was gone before the search
 PACKAGES = ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")  # what the result depends on
 
 
@@ -62,15 +62,15 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     parameters = known_parameters.parameters(selection, model, sd, known)
     over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
-    told = sentences(verdict, effects, parameters, found, far)
-    told += [not_on_offer(e.name for e in setup.physics.effects)] if verdict.name == "unexplained" else []
+    texts = sentences(verdict, effects, parameters, found, far)
+    texts += [not_on_offer(e.name for e in setup.physics.effects)] if verdict.name == "unexplained" else []
     notes = [*setup.warnings, *steps, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
     more = {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
     lies = [*located_in_words(where.found), *spectra_in_words(where.spectra)] if where else []
     rivals = black_boxes_in_words(found.part(BlackBoxes), setup.fitter.simulator.windows.blocks)
     return Diagnosis(
         verdict=verdict.name,
-        sentences=[*filter(None, [*told, not_tried(selection.state)]), *rivals, *lies],
+        sentences=[*filter(None, [*texts, not_tried(selection.state)]), *rivals, *lies],
         effects=effects,
         where=places_of(where.found) if where and where.found.spots else _where(found),
         gap=far,
@@ -85,7 +85,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         about={**about, "conditions": setup.fitter.simulator.windows.conditions} if about else {},
         hidden=list(selection.hidden),
         accuracy=known_parameters.accuracy(model, own.sheet),
-        evidence=selection.weighed.told(),
+        evidence=selection.weighed.to_dicts(),
     )
 
 
@@ -284,8 +284,8 @@ def _overlays(found: Findings) -> list[dict[str, Any]]:
                 "time": log.time[rows] - log.time[0], "measured": log.qpos[rows, q],
                 "starts": log.time[cut.start[own]] - log.time[0],
             }  # fmt: skip
-            told = {k: p for k, p in found.predictions.items() if k != "with_effects" or found.model.effects}
-            for stage, prediction in told.items():
+            shown = {k: p for k, p in found.predictions.items() if k != "with_effects" or found.model.effects}
+            for stage, prediction in shown.items():
                 error = setup.tolerance.by_dof(prediction.error[own])[..., v]
                 entry[stage] = log.qpos[rows, q] - (error * cut.sigma_q[v]).reshape(-1)
             out.append(entry)

@@ -42,13 +42,13 @@ class AtFinerSteps:
         """For the warnings; together: `[k, k]`, covariance without it."""
         fit, own = found.model.fit, {c.name for effect in found.model.effects for c in effect.coordinates}
         each = zip(fit.coordinates, fit.values, self.shift, np.sqrt(np.diag(together)), strict=True)
-        told = [
+        parts = [
             f"{c.name} {value + shift:.3g} in place of {value:.3g} {c.unit}".rstrip()
             for c, value, shift, sd in each
             if c.name in own and abs(shift) > TOLD * sd
         ]
         text = "the time step is in the parameters: at ever finer steps they would be"
-        return [f"{text} {', '.join(told)} (counted in their intervals)"] if told else []
+        return [f"{text} {', '.join(parts)} (counted in their intervals)"] if parts else []
 
 
 def stage(found: Findings, say: Progress) -> Findings:

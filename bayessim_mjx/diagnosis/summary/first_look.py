@@ -33,8 +33,8 @@ def lines(look: Look) -> list[str]:
     out += [
         f"contradicted: {titled(*label.rsplit('@', 1))}: {why}" for label, why in look.vetoes.items() if _news(label)
     ]
-    if look.told and look.told.unknown:
-        names = listed(look.told.unknown, most=FEW)
+    if look.identifiability and look.identifiability.unknown:
+        names = listed(look.identifiability.unknown, most=FEW)
         out.append(f"these logs do not tell the mass of {names} better than the data sheet does")
     return out
 
@@ -48,7 +48,7 @@ def verdict(look: Look) -> str:
     """The actuators' channel and the mechanism apart, in one sentence; nothing where no effort was measured."""
     if not look.channels:
         return ""
-    shown = [c for c in look.channels if c.told]
+    shown = [c for c in look.channels if c.identified]
     obey = all(c.sound for c in shown)
     motors = "the motors do what they are told" if obey else "the motors do not do what they are told"
     motors = motors if shown else "the encoders are too coarse to tell what the motors do"
@@ -76,7 +76,7 @@ def apart(look: Look) -> str:
 
 
 def _channels(every: Sequence[Channel]) -> str:
-    found = [c for c in every if c.told]
+    found = [c for c in every if c.identified]
     if not found:
         return "command -> effort: not told: noise of the encoders hides what the servos' own law asks for"
     off = [c for c in found if not c.sound]
@@ -85,13 +85,13 @@ def _channels(every: Sequence[Channel]) -> str:
         low, high = min(c.scale for c in found), max(c.scale for c in found)
         echo = "; the logged effort is the command itself, not a measurement" if any(c.echo for c in found) else ""
         return f"command -> effort: {low:.2f} to {high:.2f} of what is commanded, at most {late:.0f} ms late{echo}"
-    told = [
+    parts = [
         f"{c.actuator} {c.scale:.2f} of it, {1e3 * c.late:.0f} ms late, {percent(c.left)} otherwise" for c in off[:FEW]
     ]
     others = len(found) - len(off)
     rest = f"; {others} as commanded" if others else ""
     more = f"; {len(off) - FEW} more" if len(off) > FEW else ""
-    return f"command -> effort: not as commanded: {'; '.join(told)}{more}{rest}"
+    return f"command -> effort: not as commanded: {'; '.join(parts)}{more}{rest}"
 
 
 def _mechanism(look: Look) -> str:
@@ -106,10 +106,10 @@ def _mechanism(look: Look) -> str:
     worst = sorted(look.joints, key=lambda j: -j.nominal)
     if worst[0].nominal < ROUGH:
         return f"{name}: the model explains the motion of every joint to {percent(worst[0].nominal)} of the effort"
-    told = [f"{j.name} {percent(j.nominal)}{_needs(j)}" for j in worst[:FEW] if j.nominal >= ROUGH]
+    parts = [f"{j.name} {percent(j.nominal)}{_needs(j)}" for j in worst[:FEW] if j.nominal >= ROUGH]
     after = max(j.left for j in look.joints)
     tail = f"; with what follows {percent(after)} at most" if look.proposals else ""
-    return f"{name}: effort that the model does not explain (rms): {', '.join(told)}{tail}"
+    return f"{name}: effort that the model does not explain (rms): {', '.join(parts)}{tail}"
 
 
 def _needs(j: Joint) -> str:

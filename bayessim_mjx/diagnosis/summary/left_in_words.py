@@ -86,8 +86,10 @@ def formula_in_words(found: BlackBoxes) -> list[str]:
     for term in found.terms:
         text = f"{term.force:+.3g} {term.what}".removesuffix(" 1")
         each.setdefault(term.joint, []).append(f"{text[0]} {text[1:]}")
-    told = {joint: " ".join(terms).removeprefix("+ ") for joint, terms in each.items()}
-    return [f"{joint}: {'-' if text.startswith('- ') else ''}{text.removeprefix('- ')}" for joint, text in told.items()]
+    formulas = {joint: " ".join(terms).removeprefix("+ ") for joint, terms in each.items()}
+    return [
+        f"{joint}: {'-' if text.startswith('- ') else ''}{text.removeprefix('- ')}" for joint, text in formulas.items()
+    ]
 
 
 def places_of(found: Located) -> list[Place]:
@@ -109,17 +111,17 @@ def located_in_words(found: Located) -> list[str]:
             text.append(f"missing at {spot.joint}, {phrases.region(leaf.where, spot.units)}: {force}")
         if spot.looked and not spot.leaves:
             text.append(phrases.placeless_force(spot.joint, spot.size, spot.unit))
-    return text + [told for f in found.prints if (told := _signature(f))]
+    return text + [signature for f in found.prints if (signature := _signature(f))]
 
 
 def _signature(found: Fingerprint) -> str:
-    own, numbers = phrases.SIGNATURES[found.name], found.told
-    told = [
+    own, numbers = phrases.SIGNATURES[found.name], found.relevant
+    parts = [
         phrases.signed(n.value, n.low, n.high, n.unit, words)
         for key, words in own.terms.items()
         if (n := numbers.get(key)) is not None
     ]
-    return f"{found.joint}: {own.head.format(recent=LIMITS.recent)} {', '.join(told)}" if told else ""
+    return f"{found.joint}: {own.head.format(recent=LIMITS.recent)} {', '.join(parts)}" if parts else ""
 
 
 def spectra_in_words(found: Sequence[Heard]) -> list[str]:

@@ -107,7 +107,7 @@ FAR = "Far from the data sheet: {named}."
 class Limits:
     """What is worth a sentence, and how much of it is told."""
 
-    told: int = 6  # joints told one by one
+    listed_joints: int = 6  # joints told one by one
 
 
 LIMITS = Limits()
@@ -123,46 +123,46 @@ def sentences(
 ) -> list[str]:
     """The verdict, most important first."""
     name, cut = verdict.name, found.selection.state.fitter.simulator.windows
-    told = verdict_in_words(name, effects, far, verdict.remains, verdict.beaten)
+    texts = verdict_in_words(name, effects, far, verdict.remains, verdict.beaten)
     far_off, known = verdict.bent
-    told += [BENT.format(far=far_off, known=known)] if known else []
+    texts += [BENT.format(far=far_off, known=known)] if known else []
     if verdict.builds_up:
-        told.append(BUILDS_UP.format(times=f"{verdict.builds_up:.2g}", window=f"{cut.steps * cut.dt:.2g} s"))
-    told += [_coasting(far, bool(effects)), _probable(found.selection.weighed)]
+        texts.append(BUILDS_UP.format(times=f"{verdict.builds_up:.2g}", window=f"{cut.steps * cut.dt:.2g} s"))
+    texts += [_coasting(far, bool(effects)), _probable(found.selection.weighed)]
     if found.selection.ambiguous:
-        told += [_instead(e, found.selection.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]
-    told += [_hidden(found.selection.hidden, len(effects))]
+        texts += [_instead(e, found.selection.rivals.get(f"{e.name}@{e.where}", ())) for e in effects]
+    texts += [_hidden(found.selection.hidden, len(effects))]
     if verdict.noise is not None and (name == "noise" or far.beyond):
-        told.append(_of_sensors(verdict.noise.memory * cut.steps * cut.dt))
+        texts.append(_of_sensors(verdict.noise.memory * cut.steps * cut.dt))
     elif not effects and verdict.remains == 0.0 and found.selection.state.above_noise(found.selection.state.base):
-        told.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated"), held=_held(far)))
+        texts.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated"), held=_held(far)))
     if name == "unexplained" and found.flexible_winner is not None:
-        told += [f"{text[:1].upper()}{text[1:]}." for text in flexible_in_words(found.flexible_winner, cut.blocks)]
-    told += [first_look.apart(found.setup.look)]
-    told += [f"At its bound: {phrases.missing(e.name, e.where)}. {e.sentence}" for e in effects if _at_bound(e)]
-    told += _remarks(parameters)
-    return [text for text in told if text]
+        texts += [f"{text[:1].upper()}{text[1:]}." for text in flexible_in_words(found.flexible_winner, cut.blocks)]
+    texts += [first_look.apart(found.setup.look)]
+    texts += [f"At its bound: {phrases.missing(e.name, e.where)}. {e.sentence}" for e in effects if _at_bound(e)]
+    texts += _remarks(parameters)
+    return [text for text in texts if text]
 
 
 def _remarks(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """What is remarked of known parameters: a sentence for each, but one for all at a bound and for all far off."""
     stuck: dict[str, str] = {}
     far: dict[str, str] = {}
-    told = []
+    texts = []
     for name, about in parameters.items():
         value, text, sheet = f"{name} {about['mean']:.4g}", about["structural"], about.get("data_sheet")
         if text == phrases.stuck(about.get("simulated", about["mean"])):
             stuck[value] = f"{name} {text}."
         elif text:
-            told.append(f"{name} {text}.")
+            texts.append(f"{name} {text}.")
         if sheet:
             far[f"{value} ({about['away']:.1f} sd)"] = f"{name} {sheet}."
     for together, sentence in ((stuck, STUCK), (far, FAR)):
-        told += together.values() if len(together) < 2 else [sentence.format(named=listed(list(together)))]
+        texts += together.values() if len(together) < 2 else [sentence.format(named=listed(list(together)))]
     same = {name: about["same_as"] for name, about in parameters.items() if about.get("same_as")}
     labels = [label for each in same.values() for label in each]
-    told += [STANDS_FOR.format(parameters=listed(list(same)), effects=_any_of(labels))] if same else []
-    return told
+    texts += [STANDS_FOR.format(parameters=listed(list(same)), effects=_any_of(labels))] if same else []
+    return texts
 
 
 def _hidden(labels: Sequence[str], effects: int) -> str:
@@ -172,7 +172,7 @@ def _hidden(labels: Sequence[str], effects: int) -> str:
 def _any_of(labels: Sequence[str]) -> str:
     """Effects in words, not too many."""
     every = phrases.by_law([label.split("@", 1) for label in labels])
-    parts = every[: LIMITS.told]
+    parts = every[: LIMITS.listed_joints]
     parts += [f"{len(every) - len(parts)} more"] if len(every) > len(parts) else []
     return listed(parts, "or")
 
@@ -182,8 +182,8 @@ def _probable(weighed: Weighed) -> str:
     if not weighed.answer:
         return ""
     others, nothing = sum(weighed.weight[k] for k in weighed.beside), weighed.weight[BASE]
-    told = percent(nothing) if nothing > SELDOM else "less than one in a million"
-    return PROBABLE.format(share=percent(weighed.weight[weighed.answer]), others=percent(others), nothing=told)
+    chance = percent(nothing) if nothing > SELDOM else "less than one in a million"
+    return PROBABLE.format(share=percent(weighed.weight[weighed.answer]), others=percent(others), nothing=chance)
 
 
 def _coasting(far: Gap, named: bool) -> str:
@@ -302,8 +302,11 @@ def _by_joint(far: Gap, effects: bool) -> str:
     stages = ("calibrated", "with_effects") if effects else ("nominal", "calibrated")
     words = "recalibrated and with the effects" if effects else "as delivered and recalibrated"
     names = _worst(far)
-    rows = [(n, [extent(far.physical[n][s], far.physical[n]["unit"]) for s in stages]) for n in names[: LIMITS.told]]
-    more = f"; {len(names) - LIMITS.told} more in the table" if len(names) > LIMITS.told else ""
+    rows = [
+        (n, [extent(far.physical[n][s], far.physical[n]["unit"]) for s in stages])
+        for n in names[: LIMITS.listed_joints]
+    ]
+    more = f"; {len(names) - LIMITS.listed_joints} more in the table" if len(names) > LIMITS.listed_joints else ""
     return f"By joint, {words}: {'; '.join(f'{n} {a}, {b}' for n, (a, b) in rows)}{more}."
 
 

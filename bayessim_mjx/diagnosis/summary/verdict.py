@@ -27,8 +27,7 @@ class Limits:
     """
 
     # noise standard deviations that remain: of a simulator without effects, and beside effects that leave a large
-    # share. The latter was 1.5 as well until it was chosen on 573 recorded cases, where 1.2 finds six more of 21 causes
-    # that the library lacks and loses one of 245 told effects; of 327 fresh cases it finds 3 of 9 more, and loses none
+    # share (docs/decisions/at_noise.md)
     matters: float = 1.5
     shows: float = 1.2
     # share of the calibrated gap: named effects that leave more, or on top of which a flexible force closes more, are

@@ -43,7 +43,7 @@ class Message:
 
 @dataclass(frozen=True)
 class Choice:
-    """Which topics to read, and how; what is left open is found by the topics' types and names.
+    """Which topics to read, and how; the rest is found by the topics' types and names.
 
     Attributes:
         states: topic of the joint states.

@@ -66,12 +66,12 @@ def of_one_publisher(
     why = (not received and _same_stamp(messages)) or _apart(ranked) or _two_tracks(messages)
     if not why:
         return list(messages)
-    told = "; ".join(form.sentence(i, len(each)) for i, (form, each) in enumerate(ranked, 1))
+    choices = "; ".join(form.sentence(i, len(each)) for i, (form, each) in enumerate(ranked, 1))
     text = f"{name}: {topic} has more than one publisher: {why}"
     if len(ranked) == 1:
         text += "; their messages cannot be distinguished; allowed: a recording without the second publisher, another"
         raise UserError(f"{text} topic by --states TOPIC, or --stamps received, if one publisher's stamps are coarse")
-    raise UserError(f"{text}; choose by --publisher N ({told}), or another topic by --states TOPIC")
+    raise UserError(f"{text}; choose by --publisher N ({choices}), or another topic by --states TOPIC")
 
 
 def _positions(message: Message) -> dict[str, float]:

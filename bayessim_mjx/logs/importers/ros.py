@@ -46,8 +46,8 @@ def recording(name: str, messages: Iterable[Message], choice: Choice) -> Recordi
     imus = [t for t, found in by_topic.items() if found[0].kind == IMU]
     stamped = [m for t in dict.fromkeys((states, *commands, *imus)) for m in by_topic[t]]
     clock = Clock.of(stamped, choice.stamps)
-    told = of_one_publisher(name, states, [state_of(m) for m in by_topic[states]], choice.publisher, clock.received)
-    measured = {f: _joints(told, f, clock) for f in FIELDS}
+    messages = of_one_publisher(name, states, [state_of(m) for m in by_topic[states]], choice.publisher, clock.received)
+    measured = {f: _joints(messages, f, clock) for f in FIELDS}
     sent: dict[str, Stream] = {}
     for topic, names in commands.items():
         streams = _commands(name, topic, by_topic[topic], names or (), list(measured["position"]), choice, clock)
@@ -73,7 +73,7 @@ class _Topics:
     of: dict[str, list[Message]] = field(default_factory=lambda: defaultdict(list))
     unread: dict[str, str] = field(default_factory=dict)
 
-    def told(self) -> str:
+    def sentence(self) -> str:
         read = ", ".join(f"{topic} ({found[0].kind})" for topic, found in self.of.items()) or "none of use"
         return f"it has {read}" + (f"; cannot be read: {self.left()}" if self.unread else "")
 
@@ -88,12 +88,12 @@ def _command_topics(name: str, topics: _Topics, choice: Choice) -> Mapping[str, 
     if choice.commands:
         absent = [t for t in choice.commands if t not in topics.of]
         if absent:
-            raise UserError(f"{name}: --commands {absent[0]}: no such topic; {topics.told()}")
+            raise UserError(f"{name}: --commands {absent[0]}: no such topic; {topics.sentence()}")
         return choice.commands
     found = [*topics.of_kind(*COMMANDS), *(t for t in topics.of_kind(STATE) if "command" in t)]
-    found = found or topics.of_kind(CONTROLLER)  # where nothing else commands, a controller says what it was told
+    found = found or topics.of_kind(CONTROLLER)  # where nothing else commands, a controller reports its reference
     if not found:
-        raise UserError(f"{name}: no topic of commands; {topics.told()}; allowed: --commands TOPIC")
+        raise UserError(f"{name}: no topic of commands; {topics.sentence()}; allowed: --commands TOPIC")
     return {topic: () for topic in found}
 
 
@@ -101,13 +101,13 @@ def _state_topic(name: str, topics: _Topics, choice: Choice, commands: Iterable[
     found = [t for t in topics.of_kind(STATE) if t not in commands]
     if choice.states is not None:
         if choice.states not in [*found, *topics.of_kind(CONTROLLER)]:
-            raise UserError(f"{name}: --states {choice.states}: no topic of JointState; {topics.told()}")
+            raise UserError(f"{name}: --states {choice.states}: no topic of JointState; {topics.sentence()}")
         return choice.states
     found = found or topics.of_kind(CONTROLLER)
     named = [t for t in found if t.rpartition("/")[2] == "joint_states"]
     best = found if len(found) == 1 else named
     if len(best) != 1:
-        raise UserError(f"{name}: {len(found)} topics of joint states; {topics.told()}; allowed: --states TOPIC")
+        raise UserError(f"{name}: {len(found)} topics of joint states; {topics.sentence()}; allowed: --states TOPIC")
     return best[0]
 
 

@@ -76,7 +76,7 @@ def test_samples_of_a_smooth_command_lead_by_half_a_row_unless_they_are_held_lin
     robot, logs = nominal(tmp_path), smooth()
     found = estimated(robot, logs)
     assert found.certain and found.late == pytest.approx(-PERIOD / 2, rel=0.05)
-    assert "`hold: linear`" in found.told(PERIOD)[0]
+    assert "`hold: linear`" in found.notes(PERIOD)[0]
     linear = estimated(robot, [dataclasses.replace(log, metadata={"hold": "linear"}) for log in logs])
     assert not linear.certain and abs(linear.late) < 3e-4
 

@@ -9,7 +9,7 @@ import pytest
 from bayessim_mjx.diagnosis import tolerance
 from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.logcheck import noise
-from bayessim_mjx.diagnosis.logcheck.noise import noise_free, told
+from bayessim_mjx.diagnosis.logcheck.noise import noise_free, noise_known
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Log
 from tests.diagnosis.recordings import ARM, make
@@ -59,7 +59,7 @@ def test_fewer_than_three_values_in_every_log_tell_no_noise(arm, elbows):
 def test_noise_is_pooled_over_the_logs_that_tell_it(arm):
     """One of four logs shows three counts: its noise is that of the encoder, not half of it."""
     logs = [swung(arm, e, f"{k}.npz") for k, e in enumerate([HELD, HELD, counts(0, 1), counts(0, 1, 2)])]
-    assert [bool(told(log)[1]) for log in logs] == [False, False, False, True]
+    assert [bool(noise_known(log)[1]) for log in logs] == [False, False, False, True]
     assert cut(arm, logs).sigma_q[1] == pytest.approx(SIGMA, rel=0.05)
     assert not noise.not_compared(logs)
 
