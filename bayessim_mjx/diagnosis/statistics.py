@@ -31,6 +31,7 @@ class Levels:
 
 
 LEVELS = Levels()
+Z90 = 1.645  # half the width of a Gaussian's 90 % interval, in standard deviations
 NOTHING = (float("nan"), float("nan"))  # the interval of one condition
 
 

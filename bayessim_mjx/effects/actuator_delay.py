@@ -35,6 +35,7 @@ class ActuatorDelay(Effect):
     high: float = 0.1
     name: ClassVar[str] = "actuator_delay"
     kind: ClassVar[str] = "actuator"
+    late: ClassVar[bool] = True
     last: ClassVar[bool] = True
     noun: ClassVar[str] = "command delay"
     lacks: ClassVar[str] = "a command delay"

@@ -30,6 +30,7 @@ class ActuatorLag(Effect):
     high: float = 0.2
     name: ClassVar[str] = "actuator_lag"
     kind: ClassVar[str] = "actuator"
+    late: ClassVar[bool] = True
     noun: ClassVar[str] = "actuator lag"
     lacks: ClassVar[str] = "an actuator lag"
     separates: ClassVar[str] = "steps and a chirp: a lag is the slope after a step, a delay its dead time"

@@ -33,6 +33,7 @@ class SensorDelay(Effect):
     high: float = 0.05
     name: ClassVar[str] = "sensor_delay"
     kind: ClassVar[str] = "joint"
+    late: ClassVar[bool] = True
     noun: ClassVar[str] = "measurement delay"
     lacks: ClassVar[str] = "a measurement delay"
     separates: ClassVar[str] = "the loop closed in the drive against the loop closed outside; an independent clock"

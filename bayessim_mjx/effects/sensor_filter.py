@@ -32,6 +32,7 @@ class SensorFilter(Effect):
     high: float = 0.05
     name: ClassVar[str] = "sensor_filter"
     kind: ClassVar[str] = "joint"
+    late: ClassVar[bool] = True
     noun: ClassVar[str] = "measurement filter"
     lacks: ClassVar[str] = "a measurement filter"
     separates: ClassVar[str] = "a second sensor of the same joint; steps"

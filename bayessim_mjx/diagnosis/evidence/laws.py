@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -53,6 +54,21 @@ def related(one: Candidate, other: Candidate) -> bool:
     return special_case(one, other) or (here and special_case(other, one)) or inertia(one, other)
 
 
+def same_lateness(one: Candidate, other: Candidate, model: mujoco.MjModel) -> bool:
+    """Whether both make a signal of the same joint late: a delay T and a lag T shift slow signals alike, by T."""
+    late = one.effect != other.effect and _late(one.effect) and _late(other.effect)
+    return late and _joint(one, model) == _joint(other, model)
+
+
+def _joint(c: Candidate, model: mujoco.MjModel) -> str:
+    """The joint of a candidate; of an actuator the joint that it drives."""
+    if c.kind != "actuator" or c.where not in [model.actuator(i).name for i in range(model.nu)]:
+        return c.where
+    driven = model.actuator(c.where)
+    on_joint = int(driven.trntype[0]) == mujoco.mjtTrn.mjTRN_JOINT
+    return str(model.joint(int(driven.trnid[0])).name) if on_joint else c.where
+
+
 def inertia(one: Candidate, other: Candidate) -> bool:
     """Whether both change the inertia of the same body."""
     here = one.kind == other.kind == "body" and one.where == other.where and one.effect != other.effect
@@ -67,6 +83,11 @@ def special_cases(effect: Candidate) -> tuple[str, ...]:
 @functools.cache  # thousands of pairs are compared, and all installed packages are looked through for a name
 def _contained(effect: str) -> tuple[str, ...]:
     return tuple(getattr(load(effect), "contains", ())) if effect in names() else ()
+
+
+@functools.cache
+def _late(effect: str) -> bool:
+    return effect in names() and bool(load(effect).late)
 
 
 @functools.cache

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.data_sheet import SURE
 from bayessim_mjx.diagnosis.evidence.laws import compatible
+from bayessim_mjx.diagnosis.evidence.promises import Column
 from bayessim_mjx.diagnosis.evidence.sets import ODDS
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.screen import Projection, judged, projected, room, simulated
+from bayessim_mjx.diagnosis.selection.screen import Projection, judged, projected, simulated
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.selection.window_subset import looked_at, part
 
@@ -77,8 +78,34 @@ def _shown(state: SearchState, model: Model, candidates: Sequence[Candidate]) ->
     return {label: sorted(several, key=lambda pair: pair[0]) for label, several in each.items()}
 
 
+@dataclass(frozen=True, eq=False)
+class StandIn:
+    """An effect that may do the work of a known parameter's deviation from the data sheet.
+
+    Attributes:
+        candidate, column: of the effect, at one of its points; point: `[k]`, its numbers in the best amount.
+        known: `[base]`, the known parameters beside it; parameter: which of them gains most.
+        nats: by which the known parameters are likelier.
+    """
+
+    candidate: Candidate
+    column: Column
+    point: Array
+    known: Array
+    parameter: str
+    nats: float
+
+
 def by_parameters(state: SearchState, answer: Model) -> dict[str, tuple[str, ...]]:
-    """{known parameter: labels of the effects that it may stand for}, without a simulation.
+    """{known parameter: labels of the effects that it may stand for}, without a simulation (`stand_ins`)."""
+    out: dict[str, list[str]] = {}
+    for found in stand_ins(state, answer):
+        out.setdefault(found.parameter, []).append(found.candidate.label)
+    return {name: tuple(labels) for name, labels in out.items()}
+
+
+def stand_ins(state: SearchState, answer: Model) -> list[StandIn]:
+    """Effects that known parameters may stand for.
 
     An effect stands beside a parameter's deviation where known parameters do all its work (`LIMITS.hidden`), and
     where the data sheet speaks for it: without the effect's part the parameters are so much likelier that the odds
@@ -90,7 +117,7 @@ def by_parameters(state: SearchState, answer: Model) -> dict[str, tuple[str, ...
     every = _works(state, answer, fit)
     least = max(-state.log_prior(frozenset("x")) - np.log(ODDS.strong), np.log(ODDS.mention))
     away = fit.values - np.array([c.neutral for c in fit.coordinates])
-    out: dict[str, list[str]] = {}
+    base, out = len(state.fitter.base), list[StandIn]()
     while every:
         gains = {label: max(_gain(fit, away, own) for own in works) for label, works in every.items()}
         best = max(gains.values())
@@ -98,18 +125,21 @@ def by_parameters(state: SearchState, answer: Model) -> dict[str, tuple[str, ...
             break
         for label, gain in gains.items():
             if gain.nats > max(least, best.nats - np.log(ODDS.strong)):
-                out.setdefault(fit.names[gain.parameter], []).append(label)
+                column = gain.of.column
+                known = fit.values[:base] - gain.steps[:base]
+                at = fit.names[gain.parameter], gain.nats
+                out.append(StandIn(column.candidate, column, column.at(gain.amount), known, *at))
                 del every[label]
         away = away - best.steps
-    return {name: tuple(labels) for name, labels in out.items()}
+    return out
 
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """Of an effect at one point: the steps `[k]` of the fit's numbers that do it, and what its range allows of it."""
+    """Of an effect at one point: its column, and the steps `[k]` of the fit's numbers that do it."""
 
+    column: Column
     steps: Array
-    room: tuple[float, float]
 
 
 @dataclass(frozen=True, order=True)
@@ -119,6 +149,8 @@ class _Gain:
     nats: float
     parameter: int
     steps: Array = field(compare=False)
+    amount: float = field(compare=False)
+    of: _Work = field(compare=False)
 
 
 def _works(state: SearchState, answer: Model, fit: Fit) -> dict[str, list[_Work]]:
@@ -128,11 +160,11 @@ def _works(state: SearchState, answer: Model, fit: Fit) -> dict[str, list[_Work]
     others = [c for c in state.candidates if known.get(c.label) and all(compatible(c, e) for e in answer.effects)]
     project = Projection(state.fitter, fit) if others else None
     for c in others:
-        neutral, found = np.array([x.neutral for x in c.coordinates]), []
-        for point, column in known[c.label]:
-            way = np.where(c.shapes, 0.0, point - neutral)
-            steps = project.taken(column, LIMITS.hidden) if project and way.any() else None
-            found += [] if steps is None else [_Work(steps, room(c, way))]
+        found = []
+        for point, change in known[c.label]:
+            column = Column(c, point, change)
+            steps = project.taken(change, LIMITS.hidden) if project and column.way.any() else None
+            found += [] if steps is None else [_Work(column, steps)]
         out |= {c.label: found} if found else {}
     return out
 
@@ -140,13 +172,14 @@ def _works(state: SearchState, answer: Model, fit: Fit) -> dict[str, list[_Work]
 def _gain(fit: Fit, away: Array, of: _Work) -> _Gain:
     """In its best amount, of parameters so far from the data sheet `[k]`."""
     before = _far(fit.coordinates, away)
-    amounts = [float(end * share) for end in of.room if np.isfinite(end) and end for share in AMOUNTS]
+    amounts = [float(end * share) for end in of.column.room if np.isfinite(end) and end for share in AMOUNTS]
     gains = [before - _far(fit.coordinates, away - t * of.steps) for t in amounts]
     if not gains or max(gains) <= 0:
-        return _Gain(0.0, -1, np.zeros_like(away))
-    steps = amounts[int(np.argmax(gains))] * of.steps
+        return _Gain(0.0, -1, np.zeros_like(away), 0.0, of)
+    amount = amounts[int(np.argmax(gains))]
+    steps = amount * of.steps
     precision = np.array([c.precision if c.stated or c.kind else 0.0 for c in fit.coordinates])
-    return _Gain(max(gains), int(np.argmax(precision * (away**2 - (away - steps) ** 2))), steps)
+    return _Gain(max(gains), int(np.argmax(precision * (away**2 - (away - steps) ** 2))), steps, amount, of)
 
 
 def _far(coordinates: Sequence[Coordinate], away: Array) -> float:

@@ -23,7 +23,7 @@ from bayessim_mjx.diagnosis.data_sheet import ACCURACY, SURE
 from bayessim_mjx.diagnosis.evidence.gaussian import Belief, Learnt
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
-from bayessim_mjx.diagnosis.statistics import mixture_quantiles
+from bayessim_mjx.diagnosis.statistics import Z90, mixture_quantiles
 
 Array = NDArray[np.float64]
 # Shares of the nominal value that are summed over: from a seventh of the prior's accuracy to 100 %; 13 of them change
@@ -67,7 +67,7 @@ class Posterior:
         """`[k, k]`: a Gaussian's covariance with the mixture's 90 % intervals and its correlations."""
         moments = self.moments()
         low, _, high = self.quantiles()
-        scale = (high - low) / (2 * 1.645) / np.sqrt(np.maximum(np.diag(moments), 1e-300))
+        scale = (high - low) / (2 * Z90) / np.sqrt(np.maximum(np.diag(moments), 1e-300))
         return np.asarray(moments * scale[:, None] * scale)
 
     def quantiles(self, ends: Sequence[float] = ENDS) -> Array:

@@ -13,7 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.evidence.laws import as_large, inertia, related, special_case, with_same_inertia
+from bayessim_mjx.diagnosis.evidence.laws import (
+    as_large,
+    inertia,
+    related,
+    same_lateness,
+    special_case,
+    with_same_inertia,
+)
+from bayessim_mjx.diagnosis.evidence.masked_effects import stand_ins
 from bayessim_mjx.diagnosis.evidence.promises import Column, Plan, around
 from bayessim_mjx.diagnosis.evidence.sets import ODDS, Weighed
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
@@ -61,7 +69,7 @@ class Search:
     def __init__(self, state: SearchState, say: Progress) -> None:
         self.state, self.say = state, say
         self.weighing = Weighing(state)
-        self._plans: dict[Key, list[Plan]] = {}
+        self._plans: dict[Key, tuple[float, list[Plan]]] = {}  # with the evidence of the fit that they are of
         self._polished: set[Key] = set()
         self._again: set[tuple[Key, Key]] = set()
 
@@ -86,6 +94,7 @@ class Search:
             self._fit(self._todo(best), "around the new leading set", TOGETHER)  # it led in none of the rounds
             self._leading()
         self._at_one_place()
+        self._possible()
         return self.weighing.weighed()
 
     def _order(self) -> list[Key]:
@@ -118,7 +127,8 @@ class Search:
             for c in self.state.candidates:
                 points = self.state.secants.columns.get(c.label, ())
                 key = rest | {c.label}
-                if points and related(c, effect) and (self._first(best, key) if inertia(c, effect) else self._new(key)):
+                alike = related(c, effect) or same_lateness(c, effect, self.state.fitter.simulator.physics.mj_model)
+                if points and alike and (self._first(best, key) if inertia(c, effect) else self._new(key)):
                     starts, known = self._begun(model, effect, c)
                     column = Column(c, *points[-1])
                     out.append(Plan(key, np.inf, rest, (column,), (1.0,), starts, best, known))
@@ -141,9 +151,11 @@ class Search:
         return key not in self.state.models and key not in self.state.vain
 
     def _around(self, key: Key) -> list[Plan]:
-        if key not in self._plans:
-            self._plans[key] = around(self.weighing, key, self.say)
-        return self._plans[key]
+        """Plans around a set, anew where its fit has gained a nat since: their evidence is counted from that fit."""
+        total = self.weighing.total(key)
+        if key not in self._plans or abs(self._plans[key][0] - total) > 1.0:
+            self._plans[key] = total, around(self.weighing, key, self.say)
+        return self._plans[key][1]
 
     def _worth(self, plans: Sequence[Plan], sizes: Sequence[int], least: int = 0) -> list[Plan]:
         """The best of the new ones, so many of each size: a larger set also mends what is not linear."""
@@ -182,6 +194,20 @@ class Search:
             polish(self.state, [self.state.models[k] for k in some], self.say)
             self._polished |= set(some)
             self.weighing.score(some)
+
+    def _possible(self) -> None:
+        """The answer with one effect more that may do the work of a known parameter.
+
+        The logs do not need it, so it changes no name. It widens the interval of the parameter.
+        """
+        key = self.weighing.weighed().answer
+        some = [s for s in stand_ins(self.state, self.state.models[key]) if self._new(key | {s.candidate.label})]
+        plans = [
+            Plan(key | {s.candidate.label}, np.inf, key, (s.column,), (1.0,), (s.point,), key, (s.known,))
+            for s in sorted(some, key=lambda s: -s.nats)[: EFFORT.instead[0]]
+        ]
+        if plans and not self.state.settings.budget.over(TOGETHER):
+            self._fit(plans, "beside known parameters", TOGETHER)
 
     def _at_one_place(self) -> None:
         """Special cases where the laws that contain them came to rest: with the rest neutral both are one model.

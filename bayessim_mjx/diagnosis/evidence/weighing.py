@@ -19,6 +19,7 @@ from bayessim_mjx.diagnosis.residual import disturbance
 from bayessim_mjx.diagnosis.selection import heldout
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
+from bayessim_mjx.diagnosis.statistics import Z90, mixture_quantiles
 
 Array = NDArray[np.float64]
 MOVES = 3  # moves of a model towards its posterior mean, at most
@@ -203,14 +204,11 @@ def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     keys = found.possible
     share = np.array([found.sets[k] for k in keys])
     share /= share.sum()
-    known = np.zeros((base, base))
-    for key, weight in zip(keys, share, strict=True):
-        own_mean, own = _own(weighing.scored[key])
-        away = own_mean[:base] - mean[:base]
-        known += weight * (own[:base, :base] + _beside(weighing.scored[key], base) + np.outer(away, away))
+    each = [_known(weighing.scored[key], base) for key in keys]
+    away, spread = (np.array(x) for x in zip(*((m - mean[:base], s) for m, s in each), strict=True))
     sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     wider = np.ones(len(sd))
-    wider[:base] = np.sqrt(np.maximum(np.diag(known), sd[:base] ** 2)) / sd[:base]
+    wider[:base] = np.maximum(_spread(share, away, spread) / sd[:base], 1.0)
     covariance = covariance * wider[:, None] * wider
     away = np.where(
         np.arange(len(sd)) < base, 0.0, mean - answer.model.fit.values
@@ -221,6 +219,26 @@ def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     size = weighing.scale * np.sqrt(above)
     covariance = covariance + doubts.covariance(weighing.state.fitter, weighing.D, size, step, answer.fit.r)
     return Estimated(mean, covariance, answer.found.posterior, answer.learnt.hyper.noise, step)
+
+
+def _known(of: Scored, base: int) -> tuple[Array, Array]:
+    """(means, standard deviations) `[base]` of the known parameters in one set."""
+    mean, covariance = _own(of)
+    covariance = covariance[:base, :base] + _beside(of, base)
+    return mean[:base], np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+
+
+def _spread(share: Array, away: Array, sd: Array) -> Array:
+    """Standard deviations `[k]` about 0 of a mixture of Gaussians; 1.645 of them hold 90 % of it at least.
+
+    With a fifth of its probability far off, 1.645 standard deviations of a mixture do not reach there.
+
+    Args:
+        share: `[m]`, adding up to 1; away, sd: `[m, k]`, means and standard deviations.
+    """
+    both = np.concatenate([away, -away])  # the distance from 0 is within what this mixture holds up to 95 %
+    half = mixture_quantiles(np.tile(share / 2, 2), both, np.tile(sd, (2, 1)), (0.95,))[0]
+    return np.asarray(np.maximum(np.sqrt(share @ (sd**2 + away**2)), half / Z90))
 
 
 def size_in(of: Scored, effect: Candidate) -> Size:

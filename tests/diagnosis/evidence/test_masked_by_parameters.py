@@ -1,6 +1,7 @@
 """Effects that a known parameter far from the data sheet may stand for: one law, by its motion and by the prior."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,16 +31,20 @@ def test_a_kind_is_a_multivariate_student_t_and_a_stated_parameter_a_gaussian():
     assert masked_effects._far(fit.coordinates, away) == pytest.approx(expected)
 
 
+def work(room: tuple[float, float]) -> masked_effects._Work:
+    return masked_effects._Work(SimpleNamespace(room=room), np.array([0.0, 1.0]))
+
+
 def test_the_best_amount_takes_the_whole_deviation_back_and_the_range_bounds_it():
     fit = fit_of("ab", [1.0, 1.5])
     away = fit.values - 1.0
-    whole = masked_effects._gain(fit, away, masked_effects._Work(np.array([0.0, 1.0]), (-1.0, 1.0)))
+    whole = masked_effects._gain(fit, away, work((-1.0, 1.0)))
     assert whole.nats == pytest.approx(masked_effects._far(fit.coordinates, away)) and whole.parameter == 1
     np.testing.assert_allclose(whole.steps, [0.0, 0.5])
-    half = masked_effects._gain(fit, away, masked_effects._Work(np.array([0.0, 1.0]), (-1.0, 0.25)))
+    half = masked_effects._gain(fit, away, work((-1.0, 0.25)))
     np.testing.assert_allclose(half.steps, [0.0, 0.25])
     assert 0 < half.nats < whole.nats
-    wrong = masked_effects._gain(fit, away, masked_effects._Work(np.array([0.0, 1.0]), (-1.0, 0.0)))
+    wrong = masked_effects._gain(fit, away, work((-1.0, 0.0)))
     assert wrong.nats == 0.0
 
 
