@@ -12,9 +12,8 @@ from bayessim_mjx.diagnosis.logcheck import single_log
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort, looped
 from bayessim_mjx.diagnosis.logcheck.effort import LIMITS as OF_EFFORT
 from bayessim_mjx.diagnosis.logcheck.effort import Relation, relations
-from bayessim_mjx.diagnosis.logcheck.links import offsets
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding, refuse, warn
-from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing, pooled
+from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing, offsets, pooled
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import Velocity, agreeing, velocities
@@ -113,10 +112,10 @@ class Gate:
         own = iter(logs)
         return replace(self, reports=tuple(replace(r, log=next(own)) if r.usable else r for r in self.reports))
 
-    def clocked(self, commands: Late, moved: float) -> Gate:
-        """With the lateness of the commands, and with logs whose commands act `moved` s later than they did."""
-        reports = tuple(replace(r, log=r.log.shifted(moved)) for r in self.reports) if moved else self.reports
-        return replace(self, reports=reports, timing=self.timing.with_commands(commands, moved))
+    def moved(self, late: float) -> Gate:
+        """With logs whose commands act `late` s later than they did."""
+        reports = tuple(replace(r, log=r.log.shifted(late)) for r in self.reports) if late else self.reports
+        return replace(self, reports=reports, timing=replace(self.timing, moved=self.timing.moved + late))
 
     def _not_compared(self) -> tuple[str, ...]:
         """One sentence per reason: many logs of many joints would bury everything else."""
@@ -147,12 +146,10 @@ def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
     reports = tuple(_report(log, mj_model, dt) for log in logs)
     usable = [r for r in reports if r.usable]
     seen = [v for r in usable for v in r.velocities]
-    periods = [r.log.period for r in usable]
-    motion = pooled((e.joint, e.late) for r in usable for e in _first(r.relations))
-    velocities = pooled((v.channel, Late(v.lag)) for v in seen)
+    first = [(e.joint, e.late) for r in usable for e in _first(r.relations)]
     efforts = pooled(own for r in usable if not r.log.lost for own in offsets(r.log, mj_model))
-    timing = Timing(float(np.median(periods)) if periods else dt, dt, velocities, motion, efforts)
-    return Gate(reports, agreeing(seen, max([dt, *periods])), timing)
+    timing = Timing(pooled((v.channel, Late(v.lag)) for v in seen), pooled(first), efforts)
+    return Gate(reports, agreeing(seen, max([dt, *(r.log.period for r in usable)])), timing)
 
 
 def _first(related: Sequence[Relation]) -> list[Relation]:
