@@ -23,7 +23,7 @@ from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
 
 Array = NDArray[np.float64]
-DRAWS = 8  # from the posterior of the truth's parameters
+DRAWS = 8  # from the posterior of the truth's parameters; rule of thumb, not measured
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.experiment.design import Scored, Scorer
-from bayessim_mjx.diagnosis.experiment.excitation import Excitation, Limits, limits_of, menu
-from bayessim_mjx.diagnosis.experiment.rehearsal import Drives, Played, Rehearsal
+from bayessim_mjx.diagnosis.experiment.excitation import Excitation, menu
+from bayessim_mjx.diagnosis.experiment.limits import Drives, Limits, limits_of
+from bayessim_mjx.diagnosis.experiment.rehearsal import Played, Rehearsal
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model, nats
@@ -31,11 +32,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Budget:
-    """What a proposal may cost, and how many experiments are looked at."""
+    """What a proposal may cost, how many experiments are looked at, and when one is of use.
+
+    Rules of thumb, not measured, but for `nothing`: below it evidence is not worth more than a bare mention (Kass and
+    Raftery 1995, 2 ln B < 2).
+    """
 
     seconds: float = 10.0
     most: int = 4  # models compared
-    nothing: float = 1.0  # nats: less separates nobody
+    nothing: float = 1.0  # nats: less separates no models
     mild: float = 10.0  # nats: below, evidence between two models is called a tie
     budget: int = 6000  # windows simulated for a first look at the whole menu
     final: int = 3  # experiments looked at in full
@@ -102,7 +107,7 @@ def propose(
 
     Args:
         rivals_models: models to be told from the winner; None: its rivals, and without any the closest losers.
-        limits: see `excitation.limits_of`.
+        limits: see `limits.limits_of`.
     """
     setup, seed = found.setup, found.setup.seed
     cut, model = setup.fitter.simulator.windows, setup.physics.mj_model
@@ -250,7 +255,7 @@ def _named(pairs: Array, labels: Sequence[str]) -> list[dict[str, Any]]:
     ]
 
 
-PAYLOAD_SHARE = 0.5  # of the largest payload that is thought possible at the body
+PAYLOAD_SHARE = 0.5  # of the largest payload that the body is thought to carry; rule of thumb, not measured
 STANDING = (("turned on its side (90 degrees about the world's x axis)", (math.pi / 2, 0.0)),
             ("turned forward (90 degrees about the world's y axis)", (0.0, math.pi / 2)))  # fmt: skip
 

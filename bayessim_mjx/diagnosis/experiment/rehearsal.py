@@ -14,8 +14,8 @@ from flax import struct
 from numpy.typing import NDArray
 
 from bayessim_mjx.compat import compiler_options
-from bayessim_mjx.diagnosis.experiment.drives import Drives, drives_of
-from bayessim_mjx.diagnosis.experiment.excitation import Excitation, Limits, middle
+from bayessim_mjx.diagnosis.experiment.excitation import Excitation
+from bayessim_mjx.diagnosis.experiment.limits import Drives, Limits, drives_of, middle
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Drive, Physics, control_step
@@ -25,9 +25,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How an experiment is rehearsed and made smaller until it keeps its limits."""
+    """How an experiment is rehearsed and made smaller until it keeps its limits. Rules of thumb, not measured."""
 
-    lanes: int = 32  # worlds in one call
+    lanes: int = 32  # worlds in one call; the results do not depend on it
     rounds: int = 5  # of making an experiment smaller until it is safe
     shrink: float = 0.7
     slack: float = 1.02  # of a limit: rounding and noise in what the logs did

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.logcheck import loads
+from bayessim_mjx.diagnosis.logcheck import drives
 from bayessim_mjx.diagnosis.logcheck.drives import Effort, efforts
 from bayessim_mjx.diagnosis.logcheck.regressor import (
     FEWEST,
@@ -167,7 +167,7 @@ class _Picture:
     def of(cls, log: Log, model: mujoco.MjModel, cutoff: float) -> _Picture:
         inertia, moving = nominal(model), moving_bodies(model)
         sets, most = list(np.eye(len(moving))[:, :, None] * inertia), []
-        for body, place, heaviest in loads.at_the_ends(model):
+        for body, place, heaviest in drives.at_the_ends(model):
             sets.append(np.zeros_like(inertia))
             sets[-1][moving.index(body)] = inertial(1.0, place, np.zeros((3, 3)))
             most.append(heaviest)

@@ -19,17 +19,7 @@ from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import Velocity, agreeing, velocities
 from bayessim_mjx.quantities import listed, percent
 
-FEW = 3  # names that a sentence lists
-
-
-@dataclass(frozen=True)
-class Limits:
-    """When a joint follows its target. A rule of thumb, not counted."""
-
-    alike: float = 5.0  # at most so many times a target's range is the range of what follows it
-
-
-LIMITS = Limits()
+FEW = 3  # names that a sentence lists; wording alone, a rule of thumb
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +188,8 @@ def _vouched(log: Log, mj_model: mujoco.MjModel, related: Sequence[Relation], ta
         if mj_model.jnt_limited[j] and low - room <= q.min() and q.max() <= high + room:
             found.add(joint)
         moved = np.ptp(targets[joint]) if joint in targets else 0.0
-        if moved > 0 and 1 / LIMITS.alike < np.ptp(q) / moved < LIMITS.alike:
+        # halfway, on a logarithmic scale, to degrees, the unit that is nearest to the model's
+        if moved > 0 and np.ptp(q) > 0 and abs(np.log(np.ptp(q) / moved)) < 0.5 * np.log(np.degrees(1.0)):
             found.add(joint)
     return found
 

@@ -22,7 +22,6 @@ class Limits:
     min_rows: int = 20
     min_steps: int = 10
     clipped: float = 0.05  # share of the rows on one flat top
-    held: float = 0.01  # of a target's range: it does not change
     moment: float = 0.05  # s, over which a speed is taken
     # values that a register of 16 or of 32 bits holds
     registers: tuple[float, float] = (2.0**16, 2.0**32)
@@ -108,7 +107,7 @@ def clipped(log: Log, targets: Mapping[str, Array]) -> Iterator[Finding]:
         for end in (float(x.max()), float(x.min())):
             flat = _flat(x, end)
             share = float(np.mean(flat))
-            if share > LIMITS.clipped and not (target is not None and _steady(target, flat)):
+            if share > LIMITS.clipped and not (target is not None and _steady(target[flat], quantum(x))):
                 text = f"{name} is clipped at {end:.5g} ({percent(share)} of the rows"
                 drive = name.startswith("effort:")
                 yield Finding("finding", f"{text}; the drive's limit?)") if drive else warn(f"{text}; a hard stop?)")
@@ -123,10 +122,10 @@ def _measured(log: Log) -> Iterator[tuple[str, Array]]:
     yield from ((n, s) for n, s in log.streams.items() if n.startswith("effort:") and np.isfinite(s).all())
 
 
-def _steady(target: Array, rows: NDArray[np.bool_]) -> bool:
-    """Whether a target has one value in most of these rows (a coarse encoder is there early), but not everywhere."""
-    low, high = np.quantile(target[rows], (0.1, 0.9))
-    return bool(high - low < LIMITS.held * np.ptp(target))
+def _steady(target: Array, step: float) -> bool:
+    """Whether most values of a target lie within a step of the encoder."""
+    low, high = np.quantile(target, (0.1, 0.9))
+    return bool(high - low <= step)
 
 
 def _flat(x: Array, end: float) -> NDArray[np.bool_]:

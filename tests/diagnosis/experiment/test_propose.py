@@ -10,7 +10,7 @@ import yaml
 
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.evidence.sets import Weighed
-from bayessim_mjx.diagnosis.experiment.excitation import limits_of
+from bayessim_mjx.diagnosis.experiment.limits import limits_of
 from bayessim_mjx.diagnosis.experiment.propose import propose
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.robot import Robot, default_space
