@@ -5,6 +5,7 @@ Bounds keep friction from standing in for a robot that is not there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -23,6 +24,7 @@ from bayessim_mjx.diagnosis.logcheck.regressor import (
     motion,
 )
 from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial, moving_bodies, nominal
+from bayessim_mjx.diagnosis.logcheck.single_log import Finding
 from bayessim_mjx.diagnosis.logcheck.timing import Late
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.quantities import percent
@@ -92,6 +94,38 @@ def relations(log: Log, mj_model: mujoco.MjModel) -> list[Relation]:
     cutoffs = sorted({max(3.0, top / 2), top})  # the slower one is the quieter one
     pictures = [_Picture.of(log, mj_model, cutoff) for cutoff in cutoffs]
     return [_relation(log, mj_model, effort, pictures) for effort in found]
+
+
+def remarks(related: Sequence[Relation]) -> list[Finding]:
+    """A log is refused where at least half of its joints have no effort that fits their motion."""
+    best: dict[str, Relation] = {}
+    for r in related:
+        if r.explained is not None and (r.joint not in best or r.explained > (best[r.joint].explained or 0.0)):
+            best[r.joint] = r
+    bad = [r for r in best.values() if r.refused]
+    out: list[Finding] = []
+    for r in best.values():
+        explained = r.explained or 0.0
+        if r in bad:
+            out.append(Finding("refused" if 2 * len(bad) >= len(best) else "warning", _unrelated(r)))
+        elif explained < LIMITS.doubtful:
+            text = f"{r.joint}: no model explains {percent(1 - explained)} of its effort ({r.source})"
+            out.append(Finding("warning", f"{text} ({r.mend})" if r.mend else text))
+        if r.lag and r not in bad:
+            text = f"{r.joint}: its motion follows the effort ({r.source}) {r.lag * 1e3:+.0f} ms late"
+            physical = LIMITS.causal[0] <= r.lag <= LIMITS.causal[1]
+            out.append(Finding("finding", text) if physical else Finding("warning", f"{text}: do the clocks agree?"))
+    return out
+
+
+def _unrelated(r: Relation) -> str:
+    explained = r.explained or 0.0
+    share = percent(min(1.0, 1.0 - explained))
+    text = f"effort unrelated to motion: {share} of the effort of {r.joint} ({r.source}) unexplained by any model"
+    if explained >= LIMITS.refused:
+        text += f", and friction alone explains {percent(r.friction)}"
+    why = r.mend or "column not aligned in time, wrong scale, or forces that were not logged?"
+    return f"{text} ({why})"
 
 
 def _relation(
