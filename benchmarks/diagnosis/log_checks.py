@@ -10,6 +10,7 @@ those of its commands, with 1 % noise. No number of the checks was made from the
 
 import argparse
 import json
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -23,6 +24,7 @@ from counted_cases import Plan, frozen, make
 from bayessim_mjx.diagnosis.logcheck import drives, noise
 from bayessim_mjx.diagnosis.logcheck.drive_channel import channels_of
 from bayessim_mjx.diagnosis.logcheck.gate import check
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Array, Log
 
@@ -104,6 +106,48 @@ def judged(plan: Plan, folder: Path) -> Iterator[dict[str, Any]]:
         yield about | {"drive": name, "channels": [{k: getattr(c, k) for k in keys} for c in found]}
 
 
+def reading(plan: Plan, folder: Path) -> Iterator[dict[str, Any]]:
+    """One row for each way in which a file is written otherwise: into how many logs it is read, and what is said."""
+    model = mujoco.MjModel.from_xml_path(str(folder / plan.name / "model.xml"))
+    files = sorted((folder / plan.name / "logs").glob("*.csv"))
+    file, rng = files[len(files) // 3], np.random.default_rng(plan.seed)
+    header = file.read_text().splitlines()[0]
+    rows = np.loadtxt(file, delimiter=",", skiprows=1)
+    for name, change in FILES.items():
+        with tempfile.TemporaryDirectory() as place, warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            copy = Path(place) / file.name
+            np.savetxt(copy, change(rows, header.split(","), rng), "%.9g", ",", header=header, comments="")
+            copy.with_suffix(".yaml").write_text(file.with_suffix(".yaml").read_text())
+            try:
+                pieces, refused = len(read_logs(copy, model, partial=True)), ""
+            except UserError as error:
+                pieces, refused = 0, str(error)
+        texts = [str(w.message) for w in said]
+        yield {"case": plan.name, "file": name, "pieces": pieces, "refused": refused, "said": texts}
+
+
+def _in_degrees(rows: Array, header: Sequence[str], rng: np.random.Generator) -> Array:
+    turned = [name.startswith("qpos:") and name != "qpos:slider" for name in header]
+    return np.where(turned, np.degrees(rows), rows)
+
+
+def _jittered(rows: Array, header: Sequence[str], rng: np.random.Generator) -> Array:
+    out = rows.copy()
+    out[:, 0] += 0.8 * np.median(np.diff(rows[:, 0])) * rng.uniform(-0.5, 0.5, len(rows))
+    return out
+
+
+FILES: dict[str, Callable[[Array, Sequence[str], np.random.Generator], Array]] = {
+    "as it is": lambda rows, header, rng: rows,
+    "a gap of 4 periods": lambda rows, header, rng: np.delete(rows, range(40, 43), axis=0),
+    "a gap of 8 periods": lambda rows, header, rng: np.delete(rows, range(40, 47), axis=0),
+    "each seventh row again": lambda rows, header, rng: np.repeat(rows, 1 + (np.arange(len(rows)) % 7 == 0), axis=0),
+    "positions in degrees": _in_degrees,
+    "stamps that jitter": _jittered,
+}
+
+
 def _smooth(log: Log) -> Array:
     """Positions `[T, nq]` without noise: sums of slow sines of about the same size."""
     t = log.time[:, None] - log.time[0]
@@ -148,6 +192,12 @@ def table(rows: Sequence[dict[str, Any]]) -> None:
         print(f"noise free, {name}:", share([x for r in rows if r.get("fault") == name for x in r["noise free"]]))
     for name in DRIVES:
         _drives(name, [c["channels"][0] for c in rows if c.get("drive") == name and c["channels"]])
+    for name in FILES:
+        own = [r for r in rows if r.get("file") == name]
+        print(f"\nfile, {name}: refused {share([bool(r['refused']) for r in own])}", end="; ")
+        print(
+            f"in one piece {share([r['pieces'] == 1 for r in own])}, warned of {share([bool(r['said']) for r in own])}"
+        )
 
 
 def _late(rows: Sequence[dict[str, Any]]) -> None:
@@ -183,7 +233,7 @@ def main() -> None:
             continue
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            rows += judged(plan, args.cases)
+            rows += [*judged(plan, args.cases), *reading(plan, args.cases)]
         if args.out:
             args.out.write_text(json.dumps(rows, default=float))
     table(rows)

@@ -32,22 +32,22 @@ from bayessim_mjx.quantities import percent
 
 @dataclass(frozen=True)
 class Limits:
-    """How much of a logged effort the motion has to bear out. Rules of thumb, not counted."""
+    """How much of a logged effort the motion has to explain. Error rates: benchmarks/records/log_checks.json."""
 
     # share of the effort's variance explained
     refused: float = 0.3
     doubtful: float = 0.7
     # s by which motion may follow the command for physical reasons: delay, lag, elasticity; beyond it clocks disagree
     causal: tuple[float, float] = (-0.003, 0.15)
-    loaded: float = 0.5  # of what another remedy leaves unexplained, which a load has to undercut
-    # of what the lags of a robot leave unexplained, which those of a clock have to undercut
-    far_better: float = 1 / 3
+    clear: float = 0.5  # of what one explanation leaves unexplained, that a better one leaves at most
     gain: float = 0.02  # of the variance, which a lag has to explain
     far: float = 0.5  # s, the largest offset between clocks that is looked for
 
 
 LIMITS = Limits()
-FACTOR = 2.0  # a body's inertia and the actuator's gain may be wrong by this factor either way; a rule of thumb
+# A body's inertia and the actuator's gain may be wrong by this factor either way. Rule of thumb; no sound log needs more:
+# benchmarks/records/log_checks.json.
+FACTOR = 2.0
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def _relation(
     explained = max(float(c[physical].max()) for c in curves)
     best = float(curve.max())
     # a periodic motion fits one period later too
-    far = explained < LIMITS.doubtful or 1.0 - best <= LIMITS.far_better * (1.0 - explained)
+    far = explained < LIMITS.doubtful or 1.0 - best <= LIMITS.clear * (1.0 - explained)
     late, gain = _nearest(lags, curve, physical | far, test.independent)
     relation = replace(own, explained=explained, friction=test.friction(), late=late, gain=gain)
     if explained >= LIMITS.doubtful and not relation.lag:
@@ -161,7 +161,7 @@ def _relation(
     if not laden:
         other = _relation(log, mj_model, effort, pictures, laden=True)
         explained = other.explained or 0.0
-        if explained >= LIMITS.doubtful and not other.refused and 1.0 - explained < LIMITS.loaded * (1.0 - share):
+        if explained >= LIMITS.doubtful and not other.refused and 1.0 - explained < LIMITS.clear * (1.0 - share):
             return other
     return replace(relation, mend=mend, certain=certain)
 
