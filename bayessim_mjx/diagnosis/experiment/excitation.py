@@ -37,43 +37,38 @@ class Excitation:
         return f"{self.kind} on {'all joints together' if self.where == 'all' else self.where}"
 
 
+@dataclass(frozen=True, eq=False)
+class Room:
+    """What motions have: time `[T]` s, and of each degree of freedom `[nv]` the usable half range and largest speed."""
+
+    time: Array
+    half: Array
+    speed: Array
+
+
 def menu(
-    time: Array,
-    joints: Mapping[str, int],
-    alone: Sequence[str],
-    half: Array,
-    speed: Array,
-    release: Sequence[str],
-    seed: int,
+    room: Room, joints: Mapping[str, int], alone: Sequence[str], release: Sequence[str], seed: int
 ) -> list[Excitation]:
     """Every kind of motion on single joints, and on all together.
 
     Args:
-        time: `[T]`, s; joints: {name: dof} that are concerned; alone: names of those moved one at a time.
-        half, speed: `[nv]`, usable half range and largest speed.
+        joints: {name: dof} that are concerned; alone: names of those moved one at a time.
         release: names of the joints whose drive can be switched off.
     """
     places = [*alone, *(["all"] if len(joints) > 1 else [])]
-    out = []
-    for kind, shape in SHAPES.items():
-        for place in places:
-            if kind == RELEASE and place not in release:
-                continue
-            out.append(_of(kind, shape, place, time, joints, half, speed, seed))
-    return out
+    each = [(kind, place) for kind in SHAPES for place in places if kind != RELEASE or place in release]
+    return [_of(kind, place, room, joints, seed) for kind, place in each]
 
 
-def _of(
-    kind: str, shape: Any, place: str, time: Array, joints: Mapping[str, int], half: Array, speed: Array, seed: int
-) -> Excitation:
-    rng = np.random.default_rng(seed)
-    offset, live = np.zeros((len(time), len(half))), np.ones((len(time), len(half)))
+def _of(kind: str, place: str, room: Room, joints: Mapping[str, int], seed: int) -> Excitation:
+    rng, time = np.random.default_rng(seed), room.time
+    offset, live = np.zeros((len(time), len(room.half))), np.ones((len(time), len(room.half)))
     own = joints if place == "all" else {place: joints[place]}
     for k, v in enumerate(own.values()):
         # together, each joint at a pace of its own, so that their motions are not alike
         pace = 1.0 if len(own) == 1 else 0.55 + 0.45 * ((k * 0.618) % 1.0)
-        reach = half[v] if len(own) == 1 else 0.7 * half[v]
-        offset[:, v] = shape(time, reach, pace * speed[v], rng)
+        reach = room.half[v] if len(own) == 1 else 0.7 * room.half[v]
+        offset[:, v] = SHAPES[kind](time, reach, pace * room.speed[v], rng)
         if kind == RELEASE:
             live[:, v] = _held(time)
     return Excitation(kind, place, offset, live, kind == "steps of three sizes")

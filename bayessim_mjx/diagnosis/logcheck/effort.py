@@ -45,8 +45,8 @@ class Limits:
 
 
 LIMITS = Limits()
-# A body's inertia and the actuator's gain may be wrong by this factor either way. Rule of thumb; no sound log needs more:
-# benchmarks/records/log_checks.json.
+# A body's inertia and the actuator's gain may be wrong by this factor either way. Rule of thumb; no sound log needs
+# more: benchmarks/records/log_checks.json.
 FACTOR = 2.0
 
 

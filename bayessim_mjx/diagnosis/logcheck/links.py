@@ -50,9 +50,9 @@ def links(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> list[Link]:
     return [*_controllers(log, mj_model, timing), *_drives(log, mj_model, timing), *_sensors(log, timing)]
 
 
-def _link(name: str, where: str, slope: float, correlation: float, lag: float, step: float, scaled: bool) -> Link:
+def _link(name: str, where: str, found: tuple[float, float, float], step: float, scaled: bool) -> Link:
     """The verdict: sound where slope, shape and time agree within 5 %, 1 % and a sample."""
-    faults = []
+    (slope, correlation, lag), faults = found, []
     if correlation < 0.99:
         faults.append(f"the shape differs (correlation {correlation:.3f})")
     if scaled and abs(slope - 1.0) > 0.05:
@@ -75,7 +75,7 @@ def _untested(name: str, where: str, why: str) -> Link:
 
 def _controllers(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link]:
     name = "command -> effort"
-    pairs = {actuator: own for actuator, *own in commanded_and_measured(log, mj_model)}
+    pairs = {where: (asked, given, on) for where, asked, given, on in commanded_and_measured(log, mj_model)}
     for i, actuator in enumerate(log.actuators):
         if measured(log, i) is None:
             yield _untested(name, actuator, "no complete effort stream was logged")
@@ -83,9 +83,9 @@ def _controllers(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator
             yield _untested(name, actuator, "command or effort never changes while the drive is on")
         else:
             lag = timing.efforts[actuator].sure
-            asked, given, rows = pairs[actuator]
-            slope, correlation = compare(asked, given, log.period, rows, lag)
-            yield _link(name, actuator, slope, correlation, lag, log.period, controllers.declared(log.metadata))
+            asked, given, on = pairs[actuator]
+            link = (*compare(asked, given, log.period, on, lag), lag)
+            yield _link(name, actuator, link, log.period, controllers.declared(log.metadata))
 
 
 # Effort -> motion
@@ -107,8 +107,8 @@ def _drives(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link
             yield _untested(name, effort.joint, "too little motion free of contacts and limits")
             continue
         lag = timing.motion[effort.joint].sure if effort.joint in timing.motion else 0.0
-        slope, correlation = compare(signal, needed[:, effort.dof], moved.step, rows, lag)
-        yield _link(name, effort.joint, slope, correlation, lag, log.period, effort.scaled)
+        link = (*compare(signal, needed[:, effort.dof], moved.step, rows, lag), lag)
+        yield _link(name, effort.joint, link, log.period, effort.scaled)
 
 
 # Motion -> measurement
@@ -120,4 +120,4 @@ def _sensors(log: Log, timing: Timing) -> Iterator[Link]:
         yield _untested(name, "all joints", "no velocity was measured")
     for v in velocities(log):
         lag = timing.velocities[v.channel].sure if v.channel in timing.velocities else v.lag
-        yield _link(name, v.channel, v.slope, v.correlation, lag, log.period, True)
+        yield _link(name, v.channel, (v.slope, v.correlation, lag), log.period, True)

@@ -107,8 +107,8 @@ def clipped(log: Log, targets: Mapping[str, Array]) -> Iterator[Finding]:
             if share > LIMITS.clipped and not (target is not None and _steady(target[flat], quantum(x))):
                 text = f"{name} is clipped at {end:.5g} ({percent(share)} of the rows"
                 drive = name.startswith("effort:")
-                kind, end_of = ("finding", "the drive's limit") if drive else ("warning", "a hard stop")
-                yield Finding(kind, f"{text}; {end_of}?)")
+                end_of = "the drive's limit" if drive else "a hard stop"
+                yield Finding("finding" if drive else "warning", f"{text}; {end_of}?)")
 
 
 def _measured(log: Log) -> Iterator[tuple[str, Array]]:
