@@ -15,7 +15,7 @@ from bayessim_mjx.logs.log import Array, Log
 
 @dataclass(frozen=True)
 class Limits:
-    """When a drive follows its command. Error rates: benchmarks/records/first_look.json."""
+    """When a drive follows its command. Error rates: benchmarks/records/log_checks.json."""
 
     same: float = 0.03  # share by which a scale may be off, and a constant of the effort, rms
     left: float = 0.02  # of the effort, rms; in each row three times as much: a limit acts in few rows
@@ -29,7 +29,7 @@ class Limits:
 
 
 LIMITS = Limits()
-ROWS = 4  # of commands that an effort may come from: this one and those before; a choice, not counted
+ROWS = 4  # of commands that an effort may come from: this one and those before; a rule of thumb, not measured
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,10 @@ from bayessim_mjx.quantities import percent
 
 @dataclass(frozen=True)
 class Limits:
-    """What one log has to have, and which values are no measurements. Rules of thumb, not counted."""
+    """What one log has to have, and which values are no measurements. Rules of thumb.
+
+    How often flat tops, jitter and units are named falsely, and missed: benchmarks/records/log_checks.json.
+    """
 
     # fewer rows or control steps than this hold no window
     min_rows: int = 20
