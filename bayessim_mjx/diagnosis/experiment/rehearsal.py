@@ -31,10 +31,10 @@ class Rules:
     lanes: int = 32  # worlds in one call; the results do not depend on it
     rounds: int = 5  # of making an experiment smaller until it is safe
     shrink: float = 0.7
-    slack: float = 1.02  # of a limit: rounding and noise in what the logs did
 
 
 RULES = Rules()
+KEPT = 1.0 + 10.0 * float(np.finfo(np.float32).eps)  # share of a limit that may be used: all of it, but for rounding
 
 
 class Plan(struct.PyTreeNode):
@@ -129,7 +129,7 @@ class Rehearsal:
             for k, own in zip(left, runs, strict=True):
                 worst = max(self._used(*run) for run in own)
                 log = self._log(excitations[k], *own[0])
-                done[k] = Played(excitations[k], float(scale[k]), log, worst, worst <= RULES.slack)
+                done[k] = Played(excitations[k], float(scale[k]), log, worst, worst <= KEPT)
             left = [k for k in left if not done[k].safe]
             scale[left] *= RULES.shrink
             if not left:

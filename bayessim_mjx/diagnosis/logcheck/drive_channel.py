@@ -25,10 +25,10 @@ class Limits:
     terms: float = 0.01
     hidden: float = 0.1  # uncertainty of the scale above which a servo's effort is not told from its command
     late: float = 1.5  # periods of the log
-    echo: float = 1e-6  # of the effort: closer than any measurement comes to a command
 
 
 LIMITS = Limits()
+ECHO = 10.0 * float(np.finfo(np.float32).eps)  # of the effort: no measurement comes so close to a command
 ROWS = 4  # of commands that an effort may come from: this one and those before; a rule of thumb, not measured
 
 
@@ -191,6 +191,6 @@ def _echo(pairs: Sequence[_Pair]) -> bool:
         x = np.concatenate([p.raw[0, : p.raw.shape[1] - late] for p in pairs])
         y = np.concatenate([p.raw[1, late:] for p in pairs])
         scale = float(x @ y) / max(float(x @ x), 1e-300)
-        if np.abs(y - scale * x).max() < LIMITS.echo * (float(np.sqrt(np.mean(y**2))) + 1e-300):
+        if np.abs(y - scale * x).max() < ECHO * (float(np.sqrt(np.mean(y**2))) + 1e-300):
             return True
     return False
