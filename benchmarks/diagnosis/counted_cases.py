@@ -32,8 +32,8 @@ sheets. Fixed before any was simulated:
 - own integrator, seeds 9800 to 9802 (9800 and 9801): equations of motion and Runge-Kutta steps of .1 ms that are not
   MuJoCo's (`own_motion.py`), effects in turn as for data sheets. Strengths are those that MuJoCo C measures.
 
-**Frozen** (60 of the cases of MuJoCo C): of each robot the first three singles and doubles of data sheets, two poor logs, one
-null and one unknown cause. `frozen.json` has what a commit said of those that ended (`frozen.py`).
+**Frozen** (60 of the cases of MuJoCo C): of each robot the first three singles and doubles of data sheets, two poor
+logs, one null and one unknown cause. `frozen.json` has what a commit said of those that ended (`frozen.py`).
 """
 
 import dataclasses
@@ -68,7 +68,6 @@ FREE = 0.9  # of their nominal values, within which they are free where rivals a
 
 OUTSIDE = {"null": range(9600, 9610), "unknown": range(9600, 9605)}
 
-REALITIES = ("mujoco", "own laws", "own integrator")
 OTHERS = {"own laws": 9700, "own integrator": 9800}  # first seeds
 EACH = {"single": 3, "double": 3, "null": 2, "unknown": 2}  # of each robot in each of them
 
@@ -89,7 +88,7 @@ LATE = 0.02  # s
 class Plan:
     """One case before anything of it is simulated.
 
-    logs: "all", or one of POOR; scale: of its parameters' errors; reality: of REALITIES, what simulates it.
+    logs: "all", or one of POOR; scale: of its parameters' errors; reality: "mujoco", or one of OTHERS.
     """
 
     name: str

@@ -30,7 +30,9 @@ def of(plans: list, logs: str, system: str) -> counted.Plan:
 
 
 def test_there_are_as_many_cases_of_each_kind_as_was_said_beforehand(plans):
-    assert len({p.name for p in plans}) == 300 and min(p.seed for p in plans) >= 9300
+    assert len({p.name for p in plans}) == 420 and min(p.seed for p in plans) >= 9300
+    plans = [p for p in plans if p.reality == "mujoco"]
+    assert len(plans) == 300
     sheets = [p for p in plans if p.group == "sheets"]
     assert Counter((p.kind, p.system) for p in plans if p.group == "outside") == {
         (kind, system): n for kind, n in (("null", 10), ("unknown", 5)) for system in counted.SEEDS
@@ -121,9 +123,9 @@ def test_tables_count_what_holds_what_misses_and_what_did_not_end(plans, tmp_pat
     assert second.rates["false names"] == [True] and second.rates["known, other answers"] == [False]
     assert second.rates["closed"] == [False]
     assert third.rates["right"] == [False] and third.rates["known, other answers"] == [True]
-    assert killed.state == "unfinished" and not killed.rates and len(found) == 300
+    assert killed.state == "unfinished" and not killed.rates and len(found) == 420
     text = tables.tables(tmp_path)
-    assert "| pendulum | 3 of 30 | 2 of 3" in text and "unfinished: 1" in text and "not begun: 296" in text
+    assert "| pendulum | 3 of 30 | 2 of 3" in text and "unfinished: 1" in text and "not begun: 416" in text
     assert "one alone: 0, 0" in tables.tables(tmp_path, tmp_path)
 
 
@@ -145,10 +147,10 @@ def test_tables_of_alarms_unknown_causes_and_stated_probabilities(plans, tmp_pat
         path.write_text(json.dumps(told))
     found = {a.plan.name: a for a in tables.answers(tmp_path)}
     assert found[null.name].rates["alarm"] == [True] and found[null.name].stated == (0.7, False)
-    assert found[other.name].rates == {"unexplained": [False]} and found[other.name].stated is None
+    assert found[other.name].rates == {"unexplained": [False], "taken": [False]} and found[other.name].stated is None
     assert found[single.name].stated == (0.9, True)
     text = tables.tables(tmp_path)
-    assert "| pendulum | 1 of 1, 100 % (21 to 100) | 0 of 1, 0 % (0 to 79) | 50 |" in text
+    assert "| pendulum | 1 of 1, 100 % (21 to 100) | 0 of 1, 0 % (0 to 79) | 0 of 1, 0 % (0 to 79) | 50 |" in text
     assert "Brier score 0.250 of 2 answers" in text  # (.7^2 + .1^2) / 2
 
 
@@ -165,9 +167,8 @@ def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_pat
         return begun[-1]
 
     monkeypatch.setattr(command, "_begin", sleep)
-    args = argparse.Namespace(
-        out=tmp_path, jobs=1, minutes=0.01, only="sheets", systems="leg", shard="1/10", more="--accuracy 5%", does="run"
-    )
+    given = {"jobs": 1, "minutes": 0.01, "only": "sheets", "systems": "leg", "shard": "1/10", "reality": "mujoco"}
+    args = argparse.Namespace(out=tmp_path, more="--accuracy 5%", does="run", case="", **given)
     for _ in range(2):
         command.run(args)
     assert [p.wait(5) for p in begun] == [-9, -9]
