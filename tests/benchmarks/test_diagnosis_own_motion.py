@@ -1,4 +1,4 @@
-"""Equations of motion that are not MuJoCo's: MuJoCo's accelerations, energy that stays, logs that agree with its own."""
+"""Motion by equations that are not MuJoCo's: accelerations, energy, and the motion that MuJoCo's fine steps tend to."""
 
 import sys
 from pathlib import Path
@@ -14,7 +14,7 @@ import own_robot  # noqa: E402
 from own_plant import OwnPlant  # noqa: E402
 from systems import SYSTEMS  # noqa: E402
 
-from bayessim_mjx.blind.reality.menu import CAUSES  # noqa: E402
+from bayessim_mjx.blind.reality.menu import CAUSES, places  # noqa: E402
 from bayessim_mjx.blind.reality.plant import Plant, scales_of  # noqa: E402
 
 SIX = [s for s in SYSTEMS if s != "foot"]
@@ -85,6 +85,64 @@ def test_energy_stays_where_nothing_takes_it(system):
     kinetic, total = np.array(energy)[:, 1], np.array(energy).sum(1)
     assert np.ptp(kinetic) > 0.1 * np.abs(total).max()  # energy goes to and fro
     np.testing.assert_allclose(total, total[0], rtol=0, atol=1e-9 * np.ptp(kinetic))
+
+
+def caused(system: str, name: str, share: float):
+    """A robot and a cause at the first of its places, of a share of its largest size."""
+    robot = SYSTEMS[system]
+    plain = Plant(robot, {})
+    scales = scales_of(plain, [robot.record(plain, 2, 0, noise=False)])
+    cause = CAUSES[name](places(robot, name, scales)[0], scales, np.random.default_rng(0))
+    cause.size = share * cause.largest
+    return robot, cause
+
+
+@pytest.mark.parametrize(
+    ("system", "name"),
+    [
+        ("arm_servo", "payload"),
+        ("leg", "actuator_lag"),
+        ("cartpole", "joint_elasticity"),
+        ("two_link", "speed_torque_limit"),
+    ],
+)
+def test_runs_are_those_that_mujocos_steps_tend_to(system, name):
+    """MuJoCo's error falls with its step: a tenth of the step, a tenth of the difference."""
+    robot, cause = caused(system, name, 0.2)
+    own, command = OwnPlant(robot, {}, [cause]), np.full(len(robot.spec().actuators), 0.5)
+    start = np.zeros(len(own.joints)) + 0.3
+
+    def moved(plant: Plant) -> np.ndarray:
+        plant.reset(start, 0 * start, command)
+        out = []
+        for k in range(30):
+            plant.advance(command * (-1) ** (k // 10))
+            out.append(plant.measure()[0])
+        return np.array(out)
+
+    mine, off = moved(own), []
+    for finer in (1, 10):
+        plant = Plant(robot, {}, [cause])
+        plant.steps *= finer
+        plant.timestep = plant.model.opt.timestep = plant.timestep / finer
+        off.append(np.abs(moved(plant) - mine).max())
+    assert off[0] < 0.01 * np.ptp(mine) and off[1] < 0.2 * off[0]
+
+
+def test_a_link_stays_within_its_gap_and_reaches_both_flanks():
+    """A stop gives way by no more than a spring that takes up the link's speed beside the motor's force."""
+    robot, cause = caused("pendulum", "backlash", 0.5)
+    own = OwnPlant(robot, {}, [cause])
+    play, bot = own.model.joint("hinge/play"), own.robot
+    own.reset(np.array([0.5]), np.zeros(1), np.zeros(1))
+    seen, speeds = [], []
+    for k in range(200):
+        own.advance(np.array([2.0 if k % 50 < 25 else -2.0]), 20)
+        seen.append(own.data.qpos[play.qposadr[0]])
+        speeds.append(own.data.qvel[play.dofadr[0]])
+    half, soft = cause.size / 2, np.abs(speeds).max() / own_robot.STOP + 2 * 2.0 / bot.stop[play.dofadr[0]]
+    assert soft < 0.2 * half
+    assert half < max(seen) < half + soft and -half > min(seen) > -half - soft
 
 
 def test_what_is_not_written_down_is_refused():
