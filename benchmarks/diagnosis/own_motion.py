@@ -71,7 +71,7 @@ def equations(bot: Robot, q: Any, v: Any) -> tuple[Any, Any, Any, Any]:
         arm = points[:, None] - origins
         return jnp.where(turns, _cross(axis, arm), axis) * by[:, :, None]
 
-    def change(points: Any, shifts: Any, by: np.ndarray) -> Any:
+    def drifting(points: Any, shifts: Any, by: np.ndarray) -> Any:
         """`moving`, by time; shifts: [points, 3] m/s."""
         arm, drift = points[:, None] - origins, shifts[:, None] - origin_speed
         return jnp.where(turns, _cross(swing, arm) + _cross(axis, drift), swing) * by[:, :, None]
@@ -80,7 +80,7 @@ def equations(bot: Robot, q: Any, v: Any) -> tuple[Any, Any, Any, Any]:
     origin_speed = (moving(origins, bot.before) * speeds).sum(1)
     swing = _cross(((axis * hinge) * (bot.before * v)[:, :, None]).sum(1), axis)  # of the axes, by time
     linear, angular = moving(centre, bot.moves), (axis * hinge) * bot.moves[:, :, None]
-    gained = (change(centre, (linear * speeds).sum(1), bot.moves) * speeds).sum(1) - bot.gravity
+    gained = (drifting(centre, (linear * speeds).sum(1), bot.moves) * speeds).sum(1) - bot.gravity
     rate, spun = (angular * speeds).sum(1), ((swing * hinge) * (bot.moves * v)[:, :, None]).sum(1)
     inertia = _product(_product(body, bot.inertia), jnp.swapaxes(body, 1, 2))
     force = bot.mass[:, None] * gained
