@@ -1,4 +1,4 @@
-"""Gap diagnosis of recorded motion: python -m bayessim_mjx.diagnose --model robot.xml --data LOGS.
+"""Gap diagnosis of recorded motion: `bayessim-mjx diagnose --model robot.xml --data LOGS`.
 
 From Python `bayessim_mjx.diagnose("robot.xml", "logs")`.
 """
@@ -27,80 +27,68 @@ if TYPE_CHECKING:
 
 def _parser() -> cli.PlainParser:
     parser = cli.PlainParser(
-        prog=cli.prog_of("diagnose"),
+        "diagnose",
         description="Find where logs and simulator differ, which missing effects cause it, and how much they explain.",
-        usage="%(prog)s [options]\n       (--task NAME | --model FILE) --data PATH [PATH ...]",
+        usage="%(prog)s [options]\n       (--task TASK | --model FILE) --data PATH [PATH ...]",
     )
-    parser.add_argument("--task", metavar="NAME", help="a task of this library (main --list_tasks prints them)")
-    parser.add_argument("--model", metavar="FILE", help="an MJCF model with actuated hinge or slide joints")
-    parser.add_argument("--data", metavar="PATH", nargs="+", help="log files, or folders of them (docs/logs.md)")
-    parser.add_argument(
-        "--map", metavar="FILE", help="YAML file that maps the columns of the logs to the model (docs/logs.md)"
-    )
-    parser.add_argument("--parameters", metavar="FILE", help="YAML file with the parameters that may be recalibrated")
-    parser.add_argument(
-        "--effects",
-        metavar="LIST",
-        default="all",
-        help="effects to try, separated by commas: names, path.py:Class, or all that are on offer (default: all; "
-        "docs/effects.md says which ones are tried only where named)",
-    )
-    parser.add_argument(
-        "--tolerance",
-        metavar="LIMIT",
-        nargs="+",
-        default=[],
-        help="what may stay unexplained at a joint: 0.5deg, 2mm, 3%% of the motion, or elbow=0.5deg for one joint "
-        "(default: the larger of 3 noise standard deviations and 2%% of the motion)",
-    )
-    parser.add_argument(
-        "--accuracy",
-        metavar="SHARE",
-        nargs="+",
-        default=[],
-        help="how accurate known parameters are (standard deviation): 5%%, mass=2%%, elbow*=20%% (default: inferred "
-        "from the logs, one for each kind of the model's own numbers; the ranges of --parameters)",
-    )
-    parser.add_argument(
-        "--payload",
-        metavar="KG",
-        nargs="+",
-        default=[],
-        help="what the robot is rated to carry: 12kg, or tool=12kg (default: what its drives hold, up to its weight)",
-    )
-    _search_options(parser)
-    parser.add_argument(
-        "--blind",
-        metavar="DIR",
-        help="a finished blind check: what would have been missed is told (docs/blind.md)",
-    )
-    parser.add_argument("--out", metavar="DIR", default="diagnosis", help="folder for the results (default: diagnosis)")
-    parser.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed (default: 0)")
-    parser.add_argument(
-        "--group",
-        metavar="KEY",
-        help="metadata key that names the operating condition of a log; each condition is held out in turn",
-    )
-    parser.add_argument("--device", metavar="NAME", default="auto", help="auto, cpu or gpu (default: auto)")
-    parser.add_argument("--cache_dir", metavar="DIR", help="folder of compiled programs, or off")
-    parser.add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
+    robot = parser.group("robot and logs")
+    text = "name of a task, or file.py:Class (bayessim-mjx main --list_tasks)"
+    robot.add_argument("--task", metavar="TASK", help=text)
+    robot.add_argument("--model", metavar="FILE", help="an MJCF model with actuated hinge or slide joints")
+    robot.add_argument("--data", metavar="PATH", nargs="+", help="log files, or folders of them (docs/logs.md)")
+    text = "YAML file that maps the columns of the logs to the model (docs/logs.md)"
+    robot.add_argument("--map", metavar="FILE", help=text)
+    text = "metadata key that names the operating condition of a log; each condition is held out in turn"
+    robot.add_argument("--group", metavar="KEY", help=text)
+    _known(parser.group("what is known"))
+    _search(parser.group("search"))
+    _output(parser.group("output"))
+    computing = parser.group("computing")
+    computing.add_argument("--device", metavar="NAME", default="auto", help="auto, cpu or gpu")
+    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"
+    computing.add_argument("--cache_dir", metavar="DIR", help=text)
     return parser
 
 
-def _search_options(parser: cli.PlainParser) -> None:
-    """How long the search may take."""
-    parser.add_argument(
-        "--minutes",
-        metavar="M",
-        type=cli.positive("minutes"),
-        help="time that it may take: the search is cut down to it, and what was not tried is told (default: no limit)",
+def _known(group: Any) -> None:
+    """What is known of the robot, and what may stay unexplained."""
+    text = "YAML file with the parameters that may be recalibrated (default: damping, armature and mass)"
+    group.add_argument("--parameters", metavar="FILE", help=text)
+    text = (
+        "how accurate known parameters are (standard deviation): 5%%, mass=2%%, elbow*=20%% (default: inferred from "
+        "the logs, one for each kind of the model's own numbers; the ranges of --parameters)"
     )
-    parser.add_argument("--quick", action="store_true", help="a first answer: fewer windows and effects, no maps")
-    parser.add_argument(
-        "--verdict_only",
-        action="store_true",
-        help="the whole search, but no report, maps, black boxes or next experiment: diagnosis.json and effects.yaml",
+    group.add_argument("--accuracy", metavar="SHARE", nargs="+", default=[], help=text)
+    text = "what the robot is rated to carry: 12kg, or tool=12kg (default: what its drives hold, up to its weight)"
+    group.add_argument("--payload", metavar="KG", nargs="+", default=[], help=text)
+    text = (
+        "what may stay unexplained at a joint: 0.5deg, 2mm, 3%% of the motion, or elbow=0.5deg for one joint "
+        "(default: the larger of 3 noise standard deviations and 2%% of the motion)"
     )
+    group.add_argument("--tolerance", metavar="LIMIT", nargs="+", default=[], help=text)
+
+
+def _search(group: Any) -> None:
+    """What is searched, and how long that may take."""
+    text = (
+        "effects to try, separated by commas: names, path.py:Class, or all that are on offer (default: all; "
+        "docs/effects.md says which ones are tried only where named)"
+    )
+    group.add_argument("--effects", metavar="LIST", default="all", help=text)
+    text = "time that it may take: the search is cut down to it, and the result lists what was not tried"
+    group.add_argument("--minutes", metavar="M", type=cli.positive("minutes"), help=f"{text} (default: no limit)")
+    group.add_argument("--quick", action="store_true", help="a first answer: fewer windows and effects, no maps")
+    group.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed")
+
+
+def _output(group: Any) -> None:
+    """What is written, and how much of it."""
+    group.add_argument("--out", metavar="DIR", default="diagnosis", help="folder for the results")
+    text = "the whole search, but no report, maps, black boxes or next experiment: diagnosis.json and effects.yaml"
+    group.add_argument("--verdict_only", action="store_true", help=text)
+    text = "a finished blind check: list what a diagnosis would have missed (docs/blind.md)"
+    group.add_argument("--blind", metavar="DIR", help=text)
+    group.add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
 
 
 def _checked(args: argparse.Namespace) -> None:

@@ -1,4 +1,4 @@
-"""`python -m bayessim_mjx.play --task Pendulum --checkpoint best --video`: returns of a saved policy, and a video.
+"""`bayessim-mjx play --task Pendulum --checkpoint best --video`: returns of a saved policy, and a video.
 
 `--export` writes the policy as an ONNX file instead, `--hub` a folder for a model hub.
 """
@@ -31,32 +31,22 @@ KINDS = {
 def _parser() -> cli.Parser:
     without = ("--num_envs", "--max_iterations", "--video_interval", "--logger", "--name", "--resume")
     parser = cli.Parser("play", DESCRIPTION, without=without)
-    parser.add_argument(
+    tests, files = parser.group("evaluation"), parser.group("output")
+    tests.add_argument(
         "--episodes",
         metavar="N",
         type=cli.whole(1, COUNT),
         help="episodes for each kind of physics (default: --num_envs, else bayessim.realEvals)",
     )
     # Isaac Lab's; not the setting env.numEnvs, which training's batches are limited by
-    parser.add_argument("--num_envs", metavar="N", type=cli.whole(0, COUNT), dest="worlds", help="same as --episodes")
-    parser.add_argument(
-        "--use_pretrained_checkpoint",
-        action="store_true",
-        help="play the policy of the task that comes with the package (docs/pretrained.md)",
-    )
-    parser.add_argument("--physics", choices=KINDS, help="evaluate on this kind of physics only")
-    parser.add_argument(
-        "--export",
-        metavar="FILE",
-        nargs="?",
-        const="",
-        help="write the policy as an ONNX file and stop (default: in exported/ of the run)",
-    )
-    parser.add_argument(
-        "--hub",
-        metavar="FOLDER",
-        help="write a folder for a model hub: ONNX file, settings, and a card with the returns",
-    )
+    tests.add_argument("--num_envs", metavar="N", type=cli.whole(0, COUNT), dest="worlds", help="same as --episodes")
+    tests.add_argument("--physics", choices=KINDS, help="evaluate on this kind of physics only (default: all)")
+    text = "play the policy of the task that comes with the package (docs/pretrained.md)"
+    parser.group("training").add_argument("--use_pretrained_checkpoint", action="store_true", help=text)
+    text = "write the policy as an ONNX file and stop (default: in exported/ of the run)"
+    files.add_argument("--export", metavar="FILE", nargs="?", const="", help=text)
+    text = "write a folder for a model hub: ONNX file, settings, and a card with the returns"
+    files.add_argument("--hub", metavar="FOLDER", help=text)
     return parser
 
 

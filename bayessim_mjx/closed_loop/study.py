@@ -1,4 +1,4 @@
-"""The work of `bayessim_mjx.gap_loop`: simulators from a diagnosis, policies trained once and kept, the results."""
+"""The work of `bayessim-mjx gap-loop`: simulators from a diagnosis, policies trained once and kept, the results."""
 
 from __future__ import annotations
 
