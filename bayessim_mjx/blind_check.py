@@ -34,7 +34,7 @@ def _parser() -> cli.PlainParser:
         usage="%(prog)s [options]\n       (--task TASK | --model FILE) [--data PATH [PATH ...]]",
     )
     robot = parser.group("robot and logs")
-    robot.add_argument("--task", metavar="TASK", help="name of a task (bayessim-mjx main --list_tasks)")
+    robot.add_argument("--task", metavar="TASK", type=cli.task, help="name of a task, or file.py:Class")
     robot.add_argument("--model", metavar="FILE", help="an MJCF model with actuated hinge or slide joints")
     text = (
         "log files, or folders of them: conditions, commands, rates and noise are taken from them (default: a menu of "

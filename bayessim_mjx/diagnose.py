@@ -33,7 +33,7 @@ def _parser() -> cli.PlainParser:
     )
     robot = parser.group("robot and logs")
     text = "name of a task, or file.py:Class (bayessim-mjx main --list_tasks)"
-    robot.add_argument("--task", metavar="TASK", help=text)
+    robot.add_argument("--task", metavar="TASK", type=cli.task, help=text)
     robot.add_argument("--model", metavar="FILE", help="an MJCF model with actuated hinge or slide joints")
     robot.add_argument("--data", metavar="PATH", nargs="+", help="log files, or folders of them (docs/logs.md)")
     text = "YAML file that maps the columns of the logs to the model (docs/logs.md)"

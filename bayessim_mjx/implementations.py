@@ -33,7 +33,7 @@ def _parser() -> cli.PlainParser:
     )
     measured, computing = parser.group("measurement"), parser.group("computing")
     text = "name of a task, or file.py:Class (bayessim-mjx main --list_tasks)"
-    measured.add_argument("--task", metavar="TASK", required=True, help=text)
+    measured.add_argument("--task", metavar="TASK", type=cli.task, required=True, help=text)
     text = "numbers of worlds to measure with (default: the task's)"
     measured.add_argument("--num_envs", metavar="N", nargs="+", type=cli.whole(1, COUNT), help=text)
     text = f"for all rollouts together, without compiling (default: {SECONDS:.0f})"

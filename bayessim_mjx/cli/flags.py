@@ -8,7 +8,7 @@ from typing import Any
 
 from bayessim_mjx import trust
 from bayessim_mjx.cli import ancestors, commands
-from bayessim_mjx.cli.parsers import PlainParser, integer
+from bayessim_mjx.cli.parsers import PlainParser, integer, task
 from bayessim_mjx.config.layers import SECTIONS
 from bayessim_mjx.config.settings import WRITERS, Config
 from bayessim_mjx.errors import UserError, unknown
@@ -95,10 +95,11 @@ class Parser(PlainParser):
         self.command, self.without, self.unused, self.but = commands.name_of(command), without, unused, but
         for heading in ORDER:  # one without flags is not shown
             self.group(heading)
-        task = self.group(TASK)
-        task.add_argument("--task", metavar="TASK", help="name of a task, or file.py:Class; --list_tasks prints names")
-        task.add_argument("--cfg_env", metavar="FILE", help="YAML file with settings, read after cfg/<task>.yaml")
-        task.add_argument("--cfg_train", metavar="FILE", help="YAML file with PPO settings, ours or rl-pytorch's")
+        group = self.group(TASK)
+        text = "name of a task, or file.py:Class; --list_tasks prints names"
+        group.add_argument("--task", metavar="TASK", type=task, help=text)
+        group.add_argument("--cfg_env", metavar="FILE", help="YAML file with settings, read after cfg/<task>.yaml")
+        group.add_argument("--cfg_train", metavar="FILE", help="YAML file with PPO settings, ours or rl-pytorch's")
         for heading, flags in HEADINGS.items():
             for flag in flags:
                 self._setting(heading, flag)
@@ -108,7 +109,7 @@ class Parser(PlainParser):
         self.trusting(TASK)
         self._start(resume)
         self.group(OUTPUT).add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
-        task.add_argument("--list_tasks", action="store_true", help="print the names of the tasks and stop")
+        group.add_argument("--list_tasks", action="store_true", help="print the names of the tasks and stop")
         example = "ppo.gamma=0.95" if "bayessim" in unused else "bayessim.components=5"
         self.epilog = f"{self.epilog or ''}\n\nsection.key=value changes any setting: {example} (docs/commands.md)"
 

@@ -10,6 +10,7 @@ from bayessim_mjx import trust
 from bayessim_mjx.cli import commands
 from bayessim_mjx.cli.commands import SCRIPT
 from bayessim_mjx.errors import UserError, unknown
+from bayessim_mjx.task_names import is_file
 
 GENERAL = "options"  # argparse's own heading of --help
 
@@ -43,6 +44,15 @@ def positive(unit: str) -> Callable[[str], float]:
 
 
 integer = whole(-(10**25), 10**25)  # where the settings know the limits
+
+
+def task(text: str) -> str:
+    """The type of --task: the file of `slider.py:Slider` may run from now on, and is named by its full path."""
+    if not is_file(text):
+        return text
+    path, _, title = text.rpartition(":")
+    trust.allow([path])
+    return f"{Path(path).expanduser().resolve()}:{title}"
 
 
 class Help(argparse.HelpFormatter):
@@ -86,7 +96,7 @@ class PlainParser(argparse.ArgumentParser):
         text = "allow settings to use code from this Python file; repeat for more files (docs/trust.md)"
         self.group(heading).add_argument(trust.FLAG, metavar="FILE", action=Allow, default=[], help=text)
 
-    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:
+    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """As argparse's; an unknown flag comes with the nearest known one."""
         found, rest = self.parse_known_args(args, namespace)
         if rest and rest[0].startswith("-"):

@@ -18,6 +18,7 @@ from bayessim_mjx.config.layers import SECTIONS, Layer, merge
 from bayessim_mjx.config.settings import Config, EnvConfig, Frozen, Section, freeze
 from bayessim_mjx.config.yaml_text import DEPTH, read_value, read_yaml
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.task_names import settings_beside
 
 DICT = "dict"  # the source of settings that are no file
 
@@ -29,7 +30,9 @@ def cfg_folder() -> Path:
 
 
 def task_file(task: str) -> Path:
-    """cfg/<task in snake case>.yaml (which need not exist)."""
+    """cfg/<task in snake case>.yaml, or that beside the file of a task outside of the library; it need not exist."""
+    if (beside := settings_beside(task)) is not None:
+        return beside
     return cfg_folder() / (re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", task).lower() + ".yaml")
 
 
