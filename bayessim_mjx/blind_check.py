@@ -94,7 +94,7 @@ def _blind(argv: Sequence[str] | None) -> int:
     from bayessim_mjx.blind.check import Check, effects_of
     from bayessim_mjx.blind.runner import Limits, run
     from bayessim_mjx.monitor.console import Console
-    from bayessim_mjx.monitor.stages import stages
+    from bayessim_mjx.progress import stages
 
     names = effects_of(args.effects)
     check = Check(

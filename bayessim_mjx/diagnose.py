@@ -1,6 +1,6 @@
 """Gap diagnosis of recorded motion: `bayessim-mjx diagnose --model robot.xml --data LOGS`.
 
-From Python `bayessim_mjx.diagnose("robot.xml", "logs")`.
+From Python `bayessim_mjx.diagnose("robot.xml", "logs", out="found")`.
 """
 
 import argparse
@@ -8,7 +8,7 @@ import sys
 import time
 import types
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +18,12 @@ from bayessim_mjx.config import Config
 from bayessim_mjx.config.settings import SEEDS
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.outside_tasks import is_file
+from bayessim_mjx.progress import Show, Wanted, shown, stages
 from bayessim_mjx.quantities import duration
 
 if TYPE_CHECKING:
-    from bayessim_mjx.diagnosis.fitting.robot import Robot
+    from bayessim_mjx.diagnosis.fitting.robot import Robot, Source
     from bayessim_mjx.diagnosis.result import Diagnosis
 
 
@@ -101,44 +103,64 @@ def _checked(args: argparse.Namespace) -> None:
         raise UserError(f"--out {out}: there is a file of that name; give a folder")
 
 
-def _robot(task: str, model: str | None, parameters: str | None) -> "Robot":
-    from bayessim_mjx.diagnosis.fitting import robot
-
-    if model is not None:
-        return robot.of_file(model, parameters)
+def _of_task(name: str, parameters: str | Path | None) -> "Robot":
     from bayessim_mjx import registry
     from bayessim_mjx.config import load
+    from bayessim_mjx.diagnosis.fitting.robot import of_task
 
-    name = cli.task_name(task)
+    name = cli.task_name(cli.task(name))
     env: Any = registry.make(name, config=load(name))
-    return robot.of_task(env, parameters)
+    return of_task(env, parameters)
 
 
-def _diagnosis(args: argparse.Namespace, say: Any, early: Callable[[Sequence[str]], None]) -> "Diagnosis":
-    from bayessim_mjx.diagnosis import run
+def robot(source: "Source", parameters: str | Path | None = None) -> "Robot":
+    """The simulator under diagnosis: what `diagnose` takes as its model.
 
-    names = "all" if args.effects == "all" else [n.strip() for n in args.effects.split(",") if n.strip()]
-    with run.noting() as notes:
-        robot = _robot(args.task, args.model, args.parameters)
-    return run.diagnose(
-        robot,
-        args.data,
-        effects=names,
-        map=args.map,
-        group=args.group,
-        tolerance=args.tolerance,
-        accuracy=args.accuracy,
-        payload=args.payload,
-        minutes=args.minutes,
-        quick=args.quick,
-        verdict_only=args.verdict_only,
-        seed=args.seed,
-        out=args.out,
-        progress=say,
-        notes=notes,
-        about={"model": str(args.model or args.task)},
-        early=early,
-    )
+    Args:
+        source: an MJCF (or URDF) file, the name of a task (also `file.py:Class`), a MuJoCo specification or model, or a
+            Robot, which stays as it is.
+        parameters: YAML file with the parameters that may be recalibrated; None: damping, armature and mass.
+
+    Raises:
+        UserError: no such file or task, or nothing that could be diagnosed.
+    """
+    from bayessim_mjx.diagnosis.fitting.robot import robot_of
+
+    return _of_task(str(source), parameters) if _is_task(source) else robot_of(source, parameters)
+
+
+def _is_task(source: Any) -> bool:
+    if not isinstance(source, str):
+        return False
+    return is_file(source) or not (Path(source).suffix or Path(source).exists())
+
+
+def _names(effects: str) -> str | list[str]:
+    """The effects of --effects, each of which there has to be."""
+    from bayessim_mjx.effects import load
+
+    names = [n.strip() for n in effects.split(",") if n.strip()]
+    if not names:
+        raise UserError(f"--effects {effects!r}: give names separated by commas, path.py:Class, or all")
+    try:
+        for name in names:
+            if name != "all":
+                load(name)
+    except UserError as error:
+        raise UserError(f"--effects {effects}: {error}") from None
+    return "all" if names == ["all"] else names
+
+
+def _reported(result: "Diagnosis", out: str | Path, verdict_only: bool, missed: Any, say: Show) -> None:
+    """Write what is for people: the report and TensorBoard; after `verdict_only` an earlier report goes."""
+    from bayessim_mjx import report
+
+    if verdict_only:
+        (Path(out) / "report.html").unlink(missing_ok=True)
+        return
+    say("writing the report", 0, 1)
+    report.write(result, Path(out), missed)
+    report.tensorboard(result, Path(out))
 
 
 def _diagnose(argv: Sequence[str] | None) -> int:
@@ -147,26 +169,30 @@ def _diagnose(argv: Sequence[str] | None) -> int:
     missed = recall(args.blind) if args.blind else beside(args.data)
     setup_jax(Config(task="", device=args.device, cache_dir=args.cache_dir))
     from bayessim_mjx import report
-    from bayessim_mjx.monitor.stages import stages
+    from bayessim_mjx.diagnosis import run
+    from bayessim_mjx.diagnosis.fitting.robot import of_file
+    from bayessim_mjx.diagnosis.verdicts import Verdict
 
-    began = time.monotonic()
+    began, effects = time.monotonic(), _names(args.effects)
 
     def early(lines: Sequence[str]) -> None:
         _told(f"Before any simulation ({time.monotonic() - began:.1f} s):", lines, args.headless)
 
+    given = ("map", "group", "tolerance", "accuracy", "payload", "minutes", "quick", "verdict_only", "seed", "out")
     with warnings.catch_warnings(record=True), stages(args.headless) as say:  # what matters is told with the result
-        result = _diagnosis(args, say, early)
-        if args.verdict_only:
-            (Path(args.out) / "report.html").unlink(missing_ok=True)  # of an earlier answer
-        else:
-            say("writing the report", 0, 1)
-            report.write(result, Path(args.out), missed)
-            report.tensorboard(result, Path(args.out))
+        with run.noting() as notes:
+            nominal = _of_task(args.task, args.parameters) if args.task else of_file(args.model, args.parameters)
+        result = run.diagnose(
+            nominal, args.data, effects=effects, progress=say, notes=notes, early=early,
+            about={"model": str(args.model or args.task)}, **{key: getattr(args, key) for key in given},
+        )  # fmt: skip
+        _reported(result, args.out, args.verdict_only, missed, say)
     report.console(result, Path(args.out))
     if missed:
         _told(f"On this robot and these logs ({missed.page}):", missed.sentences, args.headless)
     best = Path(args.out) / ("diagnosis.json" if args.verdict_only else "report.html")
-    print(f"{duration(time.monotonic() - began)}; open {best}")
+    words = Verdict(result.verdict).words
+    print(f"{words} ({result.verdict}), after {duration(time.monotonic() - began)}; open {best}")
     return 0
 
 
@@ -184,15 +210,35 @@ main = cli.command(_diagnose)
 class _Command(types.ModuleType):
     """This module, which is also the function of its name: `bayessim_mjx.diagnose(model, logs)`."""
 
-    def __call__(self, model: Any, logs: Any, **options: Any) -> "Diagnosis":
-        """One diagnosis; arguments as of `bayessim_mjx.diagnosis.diagnose`, and `model` may be the name of a task."""
+    def __call__(
+        self, model: Any, logs: Any, *, out: str | Path | None = None, progress: Wanted = None, **options: Any
+    ) -> "Diagnosis":
+        """One diagnosis, as the command makes it.
+
+        Args:
+            model: what `robot` takes. logs: a folder, files, or `Log`s.
+            out: folder for all that the command writes, the report too; None: nothing is written.
+            progress: whether to show it on stderr; None: on a terminal or in a notebook; or a function (stage, done,
+                total).
+            options: further arguments of `bayessim_mjx.diagnosis.run.diagnose`, named as the command's flags.
+
+        Raises:
+            UserError: model, logs, effects or tolerance are not usable.
+        """
         from bayessim_mjx.diagnosis import run
 
-        if not isinstance(model, str) or Path(model).suffix or Path(model).exists():
-            return run.diagnose(model, logs, **options)
-        with run.noting() as notes:
-            robot = _robot(model, None, options.pop("parameters", None))
-        return run.diagnose(robot, logs, **{"notes": notes, "about": {"model": model}, **options})
+        about = {"model": str(model)} if isinstance(model, str | Path) else {}
+        paths = [logs] if isinstance(logs, str | Path) else list(logs)
+        known = all(isinstance(path, str | Path) for path in paths)
+        with shown(progress) as say:
+            with run.noting() as notes:
+                nominal = robot(model, options.pop("parameters", None))
+            given = {"notes": notes, "about": about, "progress": say, "out": out, **options}
+            result = run.diagnose(nominal, logs, **given)
+            if out is not None:
+                missed = beside([str(path) for path in paths]) if known else None
+                _reported(result, out, bool(options.get("verdict_only")), missed, say)
+        return result
 
 
 sys.modules[__name__].__class__ = _Command  # whichever is asked for first, module or function, both are there

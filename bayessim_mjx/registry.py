@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 from bayessim_mjx import trust
 from bayessim_mjx.effects.support import reading, storage
 from bayessim_mjx.errors import UserError, unknown
-from bayessim_mjx.task_names import GROUP, installed, is_file, names
+from bayessim_mjx.outside_tasks import GROUP, installed, is_file
+from bayessim_mjx.task_names import library, names
 
 if TYPE_CHECKING:
     from bayessim_mjx.config.settings import Config
@@ -90,7 +91,8 @@ def class_of(name: str) -> Any:
             raise UserError(f"task {name}: no class {title!r} in the file; it has: {', '.join(own) or 'none'}")
         return _checked(getattr(module, title), name)
     title = proper(name, "task")
-    if (point := installed().get(title)) is not None:
+    if title not in library():
+        point = installed()[title]
         try:
             return _checked(point.load(), title)
         except (ImportError, AttributeError) as error:
@@ -149,7 +151,7 @@ def _tried(name: str, kind: Any, given: tuple) -> "Env":
 
 
 def no_file(name: str, what: str) -> None:
-    """UserError where a model's file, or code without its class, is given for a task; `what` says where it was given."""
+    """UserError where a task is a model's file, or code without its class; `what` says where it was given."""
     if PurePath(name).suffix.lower() == ".py":
         found = re.findall(r"^class (\w+)", Path(name).read_text(), re.MULTILINE) if Path(name).is_file() else []
         raise UserError(f"{what} {name!r}: give the class too, as in {name}:{found[-1] if found else 'MyTask'}")

@@ -23,7 +23,7 @@ from bayessim_mjx.blind.reality.menu import KNOWN
 from bayessim_mjx.blind.reality.plant import Plant
 from bayessim_mjx.blind.reality.twin import base_of, closed, twins
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.task_names import is_file
+from bayessim_mjx.outside_tasks import is_file
 
 TIMEOUT = 3600.0  # s per diagnosis, against one that hangs
 KEPT = ("diagnosis.json", "answer.json")

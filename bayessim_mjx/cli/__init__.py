@@ -11,6 +11,6 @@ from bayessim_mjx.cli.status import Stop, first_writes, graceful, running
 __all__ = [
     "COMMANDS", "DEBUG_VARIABLE", "SCRIPT", "Parser", "PlainParser", "Stop", "command", "config_of", "find_checkpoint",
     "first_writes", "graceful", "integer", "list_tasks", "load_policy", "physics_settings", "pin_policy", "positive",
-    "privileged", "prog_of", "prolonged_config", "resumed_config", "running", "say_changes", "task", "task_name", "warm_start",
-    "whole",
+    "privileged", "prog_of", "prolonged_config", "resumed_config", "running", "say_changes", "task", "task_name",
+    "warm_start", "whole",
 ]  # fmt: skip

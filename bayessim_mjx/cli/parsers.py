@@ -10,7 +10,7 @@ from bayessim_mjx import trust
 from bayessim_mjx.cli import commands
 from bayessim_mjx.cli.commands import SCRIPT
 from bayessim_mjx.errors import UserError, unknown
-from bayessim_mjx.task_names import is_file
+from bayessim_mjx.outside_tasks import is_file
 
 GENERAL = "options"  # argparse's own heading of --help
 

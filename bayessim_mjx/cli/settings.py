@@ -81,7 +81,7 @@ def say_changes(run: "Run", console: Any) -> None:
 def task_name(name: str) -> str:
     """The task's proper name; UserError with the close ones where there is none, or where its file has no such task."""
     from bayessim_mjx import registry
-    from bayessim_mjx.task_names import is_file
+    from bayessim_mjx.outside_tasks import is_file
 
     registry.no_file(name, "--task")
     if is_file(name):

@@ -50,7 +50,7 @@ def correction(diagnosis: result.Diagnosis, folder: Path, known: ParameterSpace)
     file = folder / EFFECTS
     found = storage.read(file) if file.is_file() else correction_of(diagnosis, known)
     if not found.effects and not found.calibrated:
-        raise UserError(f"--diagnosis {folder}: its verdict is {diagnosis.verdict!r}, so there is nothing to correct")
+        raise UserError(f"--diagnosis {folder}: its verdict is '{diagnosis.verdict}', so there is nothing to correct")
     return found
 
 

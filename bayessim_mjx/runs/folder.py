@@ -19,9 +19,9 @@ from typing import Any
 
 from bayessim_mjx import atomic, config
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.outside_tasks import short
 from bayessim_mjx.runs import checkpoints
 from bayessim_mjx.runs.manifest import FOLDER, MANIFEST, SCHEMA, advice, best_of, differences, read
-from bayessim_mjx.task_names import short
 from bayessim_mjx.versions import git_state, versions
 
 DAMAGED = ".damaged"
