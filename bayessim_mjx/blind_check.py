@@ -4,7 +4,6 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from bayessim_mjx import cli
@@ -84,8 +83,7 @@ def _checked(args: argparse.Namespace) -> None:
         raise UserError(f"--command {args.command!r}: {error}; allowed: words as a shell takes them") from None
     if args.command and args.more:
         raise UserError("--more: these are flags of our own diagnosis; put those of another one into --command")
-    if Path(args.out).exists() and not Path(args.out).is_dir():
-        raise UserError(f"--out {args.out}: there is a file of that name; give a folder")
+    cli.writable(args.out, "--out")
 
 
 def _blind(argv: Sequence[str] | None) -> int:

@@ -45,11 +45,9 @@ def _parser() -> cli.PlainParser:
 
 
 def _settings(args: argparse.Namespace) -> tuple[Config, Any]:
-    from bayessim_mjx.runs import Run
-
     if args.pairs < 40:
         raise UserError(f"--pairs {args.pairs}: at least 40")
-    run = Run.open(args.run)
+    run = cli.open_run(args.run, "--run")
     top = {key: getattr(args, key) for key in ("device", "cache_dir") if getattr(args, key) is not None}
     config = dataclasses.replace(run.config, **top)
     if config.bayessim.modelClass is None:

@@ -98,9 +98,7 @@ def _checked(args: argparse.Namespace) -> None:
         raise UserError("give one of --task NAME and --model FILE")
     if not args.data:
         raise UserError("--data is missing: give files or folders of logs")
-    out = Path(args.out)
-    if out.exists() and not out.is_dir():
-        raise UserError(f"--out {out}: there is a file of that name; give a folder")
+    cli.writable(args.out, "--out")
 
 
 def _of_task(name: str, parameters: str | Path | None) -> "Robot":

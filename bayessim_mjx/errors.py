@@ -26,14 +26,13 @@ def nearest(given: str, names: Iterable[str], n: int = 3, cutoff: float = 0.6) -
     return difflib.get_close_matches(given, list(names), n, cutoff)
 
 
-def unknown(what: str, given: str, allowed: Iterable[str]) -> UserError:
-    """The error for a name that does not exist: the close ones first; then all, of many only their number."""
+def unknown(what: str, given: str, allowed: Iterable[str], page: str = "") -> UserError:
+    """The error for a name that does not exist: the close ones first; then all, or of many the page that lists them."""
     names = list(allowed)
     last = {n.rpartition(".")[2].lower(): n for n in names}
     close = [last[n] for n in nearest(given.rpartition(".")[2].lower(), last)]
     hint = f" Did you mean {' or '.join(close)}?" if close else ""
-    many = close and len(names) > MANY
-    allowed = f"one of {len(names)} names" if many else ", ".join(names)
+    allowed = f"those in {page}" if page and close and len(names) > MANY else ", ".join(names)
     return UserError(f"{what} {given!r} is unknown.{hint} Allowed: {allowed}")
 
 

@@ -59,6 +59,8 @@ def _check(args: argparse.Namespace) -> None:
         )
     if bool(args.real) == bool(args.surrogate):
         raise UserError("give one of --surrogate FILE (a stand-in for the real system) and --real LOGS")
+    if args.out:
+        cli.writable(args.out, "--out")
     if args.surrogate and not Path(args.surrogate).is_file():
         raise UserError(f"--surrogate {args.surrogate}: no such file; expected the hidden truth as an effects.yaml")
     for flag, least in (("seeds", 1), ("episodes", 2), ("iterations", 1)):

@@ -139,6 +139,7 @@ def _logs(argv: Sequence[str] | None) -> int:
     if args.format == "check":
         return _checked(args)
     scale, of_commands = _scales(args)
+    cli.writable(args.out, "--out")
     from bayessim_mjx.logs.importers.folder import Target
 
     model = _model(args.model)

@@ -75,10 +75,8 @@ def _parser() -> cli.Parser:
 
 def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
     """(settings, run to go on with or None)."""
-    from bayessim_mjx.runs import Run
-
     if args.resume:
-        run = Run.open(args.resume)
+        run = cli.open_run(args.resume, "--resume")
         if args.max_iterations is not None:
             raise UserError(
                 "--max_iterations: all rounds of a run have the same number, also those that are done; to train longer "
@@ -185,6 +183,8 @@ def _adapt(argv: Sequence[str] | None) -> int:
     config, run = _prepare(args)
     if config.randomization.get("randomize") is False and config.bayessim.modelClass is not None:
         raise UserError("task.randomize = False: there is nothing to infer; use bayessim-mjx train for PPO alone")
+    if run is None:
+        cli.writable(config.logdir, "--logdir")
     from bayessim_mjx.monitor.console import Console
 
     device = setup_jax(config)

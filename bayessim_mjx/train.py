@@ -277,11 +277,9 @@ def _train(argv: Sequence[str] | None) -> int:
     args = _parser().parse(argv)
     if args.list_tasks:
         return cli.list_tasks()
-    from bayessim_mjx.runs import Run
-
     command = [cli.SCRIPT, "train", *argv]
     if args.resume:
-        run = Run.open(args.resume)
+        run = cli.open_run(args.resume, "--resume")
         return _run(cli.prolonged_config(args, run), run, command, args.headless)
     more = cli.physics_settings(args)
     if args.agent:
@@ -290,7 +288,9 @@ def _train(argv: Sequence[str] | None) -> int:
         more["--distil"] = ("ppo.teacher", str(cli.find_checkpoint(args.distil, None, "")[0]))
     if args.checkpoint:
         more["--checkpoint"] = ("bayessim.policyCheckpt", args.checkpoint)
-    return _run(cli.pin_policy(cli.config_of(args, more)), None, command, args.headless)
+    config = cli.pin_policy(cli.config_of(args, more))
+    cli.writable(config.logdir, "--logdir")
+    return _run(config, None, command, args.headless)
 
 
 main = cli.command(_train)

@@ -11,7 +11,7 @@ from bayessim_mjx.cli import ancestors, commands
 from bayessim_mjx.cli.parsers import PlainParser, integer, task
 from bayessim_mjx.config.layers import SECTIONS
 from bayessim_mjx.config.settings import WRITERS, Config
-from bayessim_mjx.errors import UserError, unknown
+from bayessim_mjx.errors import UserError
 
 
 def _writers(text: str) -> tuple[str, ...]:
@@ -163,7 +163,7 @@ class Parser(PlainParser):
         if flag.startswith("--") and (said := ancestors.word(flag)):
             raise UserError(f"{flag}: {said}")
         if text.startswith("-"):
-            raise self.refusal(unknown("flag", flag, sorted(self._option_string_actions)))
+            raise self.unknown_flag(flag, self._option_string_actions)
         if commands.name_of(text) in commands.COMMANDS:
             raise UserError(f"{text!r} is a command of its own: {commands.prog_of(text)}")
         if "=" not in text:

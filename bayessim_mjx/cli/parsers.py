@@ -2,14 +2,14 @@
 
 import argparse
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from bayessim_mjx import trust
 from bayessim_mjx.cli import commands
 from bayessim_mjx.cli.commands import SCRIPT
-from bayessim_mjx.errors import UserError, unknown
+from bayessim_mjx.errors import UserError, nearest
 from bayessim_mjx.outside_tasks import is_file
 
 GENERAL = "options"  # argparse's own heading of --help
@@ -101,7 +101,7 @@ class PlainParser(argparse.ArgumentParser):
         found, rest = self.parse_known_args(args, namespace)
         if rest and rest[0].startswith("-"):
             flags = {flag for parser in [self, *self._below()] for flag in parser._option_string_actions}
-            raise self.refusal(unknown("flag", rest[0].split("=")[0], sorted(flags)))
+            raise self.unknown_flag(rest[0].split("=")[0], flags)
         if rest:
             self.error(f"{rest[0]!r} is neither a flag nor a flag's value")
         return found
@@ -110,6 +110,12 @@ class PlainParser(argparse.ArgumentParser):
         """The parsers of the parts of this command."""
         parts = (a for a in self._actions if isinstance(a, argparse._SubParsersAction))
         return [parser for action in parts for parser in action.choices.values()]
+
+    def unknown_flag(self, flag: str, known: Iterable[str]) -> UserError:
+        """The error for a flag that does not exist, with the close ones."""
+        close = nearest(flag, known, 2)
+        hint = f" Did you mean {' or '.join(close)}?" if close else ""
+        return UserError(f"flag {flag!r} is unknown.{hint} Allowed: the flags that {self.prog} --help lists")
 
     def refusal(self, error: UserError) -> UserError:
         """The error with the command that lists what is allowed."""

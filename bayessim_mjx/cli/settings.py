@@ -30,7 +30,7 @@ def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | No
         print(f"note: {warning.message}", file=sys.stderr)
     task_name(settings.task)
     if args.idle:
-        raise UserError(f"{args.idle[0]}: {args.command} has no use for it")
+        raise UserError(f"{args.idle[0]}: {args.command} has no use for it; leave it out")
     return settings
 
 

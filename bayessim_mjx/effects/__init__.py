@@ -88,8 +88,8 @@ def recorded(spec: str) -> type[Effect]:
             raise UserError(f"effect {spec!r}: its package cannot be imported: {error}") from error
         return _checked(kind, spec, spec)
     close = difflib.get_close_matches(str(spec), names())
-    hint = f"did you mean {close[0]}? " if close else ""
-    raise UserError(f"no effect {spec!r}; {hint}there are: {', '.join(names())}; or a file: path.py:MyEffect")
+    hint = f"did you mean {close[0]}? docs/effects.md lists all" if close else f"there are: {', '.join(names())}"
+    raise UserError(f"no effect {spec!r}; {hint}; or a file: path.py:MyEffect")
 
 
 def known(name: str) -> type[Effect] | None:
