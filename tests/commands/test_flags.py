@@ -2,6 +2,7 @@
 
 import ast
 import errno
+import re
 import runpy
 import shlex
 import subprocess
@@ -145,6 +146,17 @@ def test_the_examples_of_the_helps_are_accepted(monkeypatch: Any) -> None:
             args = parser().parse(words) if isinstance(parser(), cli.Parser) else parser().parse_args(words)
             if "--task" in words and isinstance(parser(), cli.Parser) and "LOGS" not in example:
                 assert cli.config_of(args).task == args.task
+
+
+def test_messages_spell_commands_as_the_helps_do() -> None:
+    """`python -m` and names of modules are for programs; a person types `bayessim-mjx COMMAND`."""
+    modules = "|".join(module_of(name) for name in cli.COMMANDS if name not in ("help", "completion"))
+    package = Path(bayessim_mjx.__file__).parent
+    found = {
+        file.relative_to(package).as_posix(): re.findall(rf"python -m bayessim_mjx\.(?:{modules})\b", file.read_text())
+        for file in [*package.rglob("*.py"), *package.rglob("*.json"), *package.rglob("*.j2")]
+    }
+    assert {name: calls for name, calls in found.items() if calls} == {"main.py": ["python -m bayessim_mjx.main"]}
 
 
 def test_flags_and_settings_without_a_command_are_those_of_main(capsys: pytest.CaptureFixture) -> None:

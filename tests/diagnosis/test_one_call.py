@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
 
 import mujoco
@@ -126,6 +127,8 @@ def test_verdicts_have_words_that_the_report_has_too():
     from bayessim_mjx.report import words
 
     assert [v.words for v in diagnosis.Verdict] == [words.VERDICTS[v].badge for v in diagnosis.Verdict]
+    page = (Path(__file__).parents[2] / "docs" / "diagnosis.md").read_text().lower()
+    assert [v.words for v in diagnosis.Verdict if v.words.lower() not in page] == []
     assert diagnosis.Verdict("effects") == "effects" == f"{fake.full().verdict}"
     assert json.loads(json.dumps(fake.full().to_dict()))["verdict"] == "effects"
 
