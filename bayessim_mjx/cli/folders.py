@@ -35,9 +35,12 @@ def open_run(folder: str | Path, flag: str) -> "Run":
     """
     from bayessim_mjx.runs import MANIFEST, Run
 
-    if not (Path(folder) / MANIFEST).is_file():
-        raise UserError(
-            f"{flag} {folder}: not a run folder (no {MANIFEST} in it); give the folder that a run prints "
-            "at its start, <logdir>/<Task>/<date>"
-        )
-    return Run.open(folder)
+    try:
+        return Run.open(folder)
+    except UserError:
+        if (Path(folder) / MANIFEST).is_file():
+            raise
+    raise UserError(
+        f"{flag} {folder}: not a run folder (no {MANIFEST} in it); give the folder that a run prints at its start, "
+        "<logdir>/<Task>/<date>"
+    )

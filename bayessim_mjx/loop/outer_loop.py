@@ -30,7 +30,7 @@ from bayessim_mjx.loop.round_inference import PREDICTIVE_DRAWS, infer, new_netwo
 from bayessim_mjx.loop.sources import Recorded, make_source
 from bayessim_mjx.loop.state import KEPT_ROUNDS, Loop, LoopState, RoundInfo, domain_or_prior
 from bayessim_mjx.loop.trajectories import no_motion
-from bayessim_mjx.loop.watching import Watching
+from bayessim_mjx.loop.watching import Monitor, Watching
 from bayessim_mjx.parameters.ranged import Ranged
 from bayessim_mjx.progress import shown
 from bayessim_mjx.rl import Policy, TrainState
@@ -40,13 +40,6 @@ __all__ = [
     "PREDICTIVE_DRAWS", "Checkpoints", "Loop", "LoopState", "Monitor", "RoundInfo", "checkpoint_step", "init", "make",
     "meta_of", "reexamine", "run", "score", "step", "train", "training_target", "tree_of",
 ]  # fmt: skip
-
-
-class Monitor(Protocol):
-    """Observer of the loop while it runs; every method may do nothing."""
-
-    def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None: ...
-    def round(self, info: RoundInfo, policy: Policy) -> None: ...
 
 
 class Checkpoints(Protocol):

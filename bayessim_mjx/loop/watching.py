@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import shutil
+from typing import TYPE_CHECKING, Protocol
 
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
 from bayessim_mjx.progress import Show
 from bayessim_mjx.quantities import compact, duration, estimate, is_number, spread
 
 if TYPE_CHECKING:
-    from bayessim_mjx.loop.outer_loop import Monitor
     from bayessim_mjx.rl import Policy
 
-MOST = 4  # parameters in the line of a round; no source: they fit on a line of a terminal
+
+class Monitor(Protocol):
+    """Observer of the loop while it runs; every method may do nothing."""
+
+    def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None: ...
+    def round(self, info: RoundInfo, policy: Policy) -> None: ...
 
 
 class Watching:
@@ -50,10 +55,15 @@ class Watching:
 
 
 def line_of(info: RoundInfo) -> str:
-    """`round 1/2: return -84 +- 5, mass 1.00 +- 0.06, ..., 2 min`: median and 68 % of the narrowest parameters."""
-    parts = [f"round {info.round + 1}/{info.rounds}: return {estimate(info.returns.mean(), info.returns.std())}"]
-    if info.posterior is not None:
-        rows: list[tuple[str, Any]] = sorted(info.posterior.describe().items(), key=lambda row: -row[1]["contraction"])
-        parts += [f"{name} {spread(r['median'], r['q16'], r['q84'], r['sd'])}" for name, r in rows[:MOST]]
-        parts += [f"and {len(rows) - MOST} more parameters"] if len(rows) > MOST else []
-    return ", ".join([*parts, duration(sum(info.seconds.values()))])
+    """`round 1/2: return -84 +- 5, 2 min, mass 1.00 +- 0.06, ...`: median and 68 % of as many parameters as fit."""
+    earned = estimate(info.returns.mean(), info.returns.std())
+    line = f"round {info.round + 1}/{info.rounds}: return {earned}, {duration(sum(info.seconds.values()))}"
+    if info.posterior is None:
+        return line
+    room = shutil.get_terminal_size().columns
+    for name, r in sorted(info.posterior.describe().items(), key=lambda row: -row[1]["contraction"]):
+        longer = f"{line}, {name} {spread(r['median'], r['q16'], r['q84'], r['sd'])}"
+        if len(longer) > room:
+            return f"{line} ..."
+        line = longer
+    return line

@@ -45,15 +45,18 @@ def test_the_loop_shows_the_parts_of_a_round_and_its_result(capsys: Any, monkeyp
     assert capsys.readouterr() == ("", "")
 
 
-def test_the_line_of_a_round_has_return_and_posterior() -> None:
+def test_the_line_of_a_round_has_return_and_posterior(monkeypatch: Any) -> None:
     numbers = {
         "returns": np.array([-80.0, -90.0]),
         "posterior": Distribution.prior(TOY.space),
         "seconds": {"fit": 65.0},
     }
     empty = dict.fromkeys(f.name for f in dataclasses.fields(loop.RoundInfo))
-    line = watching.line_of(loop.RoundInfo(**{**empty, "round": 0, "rounds": 2, **numbers}))
-    assert line == "round 1/2: return -85.0 ± 5.0, mass 1.25 ± 0.51, 1 min 05 s"  # 68 % of [0.5, 2]: 0.74 to 1.76
+    info = loop.RoundInfo(**{**empty, "round": 0, "rounds": 2, **numbers})
+    line = watching.line_of(info)
+    assert line == "round 1/2: return -85.0 ± 5.0, 1 min 05 s, mass 1.25 ± 0.51"  # 68 % of [0.5, 2]: 0.74 to 1.76
+    monkeypatch.setenv("COLUMNS", "50")
+    assert watching.line_of(info) == "round 1/2: return -85.0 ± 5.0, 1 min 05 s ..."
 
 
 def test_a_monitor_takes_the_place_of_progress(capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
