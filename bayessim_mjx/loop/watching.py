@@ -6,7 +6,7 @@ import shutil
 from typing import TYPE_CHECKING, Protocol
 
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
-from bayessim_mjx.progress import Show
+from bayessim_mjx.progress import Show, Silent
 from bayessim_mjx.quantities import compact, duration, estimate, is_number, spread
 
 if TYPE_CHECKING:
@@ -51,7 +51,8 @@ class Watching:
     def round(self, info: RoundInfo, policy: Policy) -> None:
         if self.monitor is not None:
             self.monitor.round(info, policy)
-        self.show.line(line_of(info))
+        if not isinstance(self.show, Silent):
+            self.show.line(line_of(info))
 
 
 def line_of(info: RoundInfo) -> str:
