@@ -80,7 +80,8 @@ def derivative(time: Array, x: Array, sigma: float) -> tuple[Array, float]:
     even = np.interp(grid, time, x) if quantum(x) > 0 else CubicSpline(time, x)(grid)
     window = smoothing_window(even, step, sigma)
     rate = savgol_filter(even, window, _POLYNOMIAL, deriv=1, delta=step)
-    # Var[rate] = sigma^2 sum_k c_k^2, c = the filter's taps
+    # Var[rate] = sigma^2 sum_k c_k^2, c = the filter's taps; no position is known better than its rounding
+    sigma = max(sigma, 10.0 * float(np.finfo(np.float64).eps) * float(np.abs(x).max()))
     spread = sigma * float(np.linalg.norm(savgol_coeffs(window, _POLYNOMIAL, deriv=1, delta=step)))
     return CubicSpline(grid, rate)(time), spread
 
