@@ -16,7 +16,6 @@ from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.discretisation import contacts, refined
 from bayessim_mjx.diagnosis.fitting.simulator import FAR, Simulator, physics_of
 from bayessim_mjx.diagnosis.selection.budget import Progress
-from bayessim_mjx.diagnosis.summary.whole_logs import theta_of
 from bayessim_mjx.physics import staggered
 
 Array = NDArray[np.float64]
@@ -64,7 +63,8 @@ def _shift(found: Findings) -> Array | None:
     """Of the coordinates; None where finer steps cannot be simulated."""
     fit, fitter = found.model.fit, found.setup.fitter
     simulator = _simulator(found)
-    theta = theta_of(found, simulator, found.model, fit.values)
+    space, small = found.setup.physics.space, simulator.physics.space
+    theta = fitter.vector(fit.coordinates, fit.values)[[space.index(name) for name in small.names]]
     errors = simulator.run(theta[None], fit.offsets[None])
     if np.abs(errors).max() >= FAR:
         return None
