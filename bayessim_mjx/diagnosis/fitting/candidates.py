@@ -184,14 +184,12 @@ def _candidate(effect: Effect, where: str, blocks: Sequence[Block]) -> Candidate
         name = own[0].name if len(own) == 1 else f"all.{effect.name}.{q.name}"
         coordinates.append(Coordinate(name, index, own[0].nominal, low, high, unit=own[0].unit))
     believed = zip(coordinates, effect.quantities, strict=True)
-    shown = tuple(_stated(c) if q.stated else replace(c, precision=shrink(c)) for c, q in believed)
+    shown = tuple(
+        replace(c, precision=STATED**2 * shrink(c), stated=True) if q.stated else replace(c, precision=shrink(c))
+        for c, q in believed
+    )
     shapes = tuple(q.shape for q in effect.quantities)
     return Candidate(effect.name, where, effect.kind, shown, shapes, _probes(effect, shown))
-
-
-def _stated(c: Coordinate) -> Coordinate:
-    """As a data sheet states it (`Quantity.stated`)."""
-    return replace(c, precision=(STATED / (c.high - c.low)) ** 2, stated=True)
 
 
 def shrink(c: Coordinate) -> float:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting import quadratic
 from bayessim_mjx.diagnosis.fitting.robot import Robot
+from bayessim_mjx.diagnosis.fitting.simulable import contacts
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
@@ -212,7 +213,8 @@ def measure(
     one, two = settle(coarse - mid), settle(mid - fine)
     gain = _gain(one / sigma, two / sigma)
     truth = fine if touching else fine + (fine - mid) / max(gain - 1, 1.0)
-    worth = _size(one, touching) * _all(gain, touching)
+    # what all halvings change, in what the first one does: alike, or with contacts each in a way of its own
+    worth = _size(one, touching) * (1 / np.sqrt(1 - gain**-2.0) if touching else gain / (gain - 1))
     at = {first * f: worth / gain ** np.log2(f) for f in (*RULES.factors, *RULES.more)}
     settled = _size(settle(plain - truth), touching)
     clean = np.array([noise_free(logs, i) for i in physics.mj_model.jnt_qposadr[physics.mj_model.dof_jntid]])
@@ -246,11 +248,6 @@ def _gain(one: Array, two: Array) -> float:
     return float(np.clip(ratio, 1.1, 4.0))
 
 
-def _all(gain: float, touching: bool) -> float:
-    """What all halvings change, in what the first one does: alike, or with contacts each in a way of its own."""
-    return float(1 / np.sqrt(1 - gain**-2.0)) if touching else gain / (gain - 1)
-
-
 def _choose(error: dict[int, float], gain: float, first: int = 1) -> int:
     """The coarsest factor that is fine enough; where none is, the finest, if finer ones gain anything."""
     enough = [f for f, e in error.items() if e < RULES.enough]
@@ -276,8 +273,3 @@ def _size(error: Array, touching: bool) -> Array:
     each = np.mean(error**2, axis=1)
     usual = np.median(each, axis=0)
     return np.asarray(np.sqrt(usual if touching else np.mean(np.minimum(each, quadratic.RULES.far**2 * usual), axis=0)))
-
-
-def contacts(physics: Physics) -> bool:
-    """Whether anything can touch."""
-    return bool(physics.template._impl.contact.dist.shape[0])

@@ -227,26 +227,7 @@ class Simulator:
         force: NDArray[np.float32] | None = None,
     ) -> Array:
         """`run` of worlds one by one: `[m, H, 2 nv]` for indices `[m]` of thetas and windows, offsets `[m, 2 nv]`."""
-        count = len(of_theta)
-        moved = None if offsets is None else np.asarray(offsets, np.float32)
-        acting, thetas = self.physics.acting(thetas), np.asarray(thetas, np.float32)
-
-        def given(first: int) -> tuple:
-            own = first + np.minimum(np.arange(self.lanes), min(self.lanes, count - first) - 1)
-            offset = self._no_offset if moved is None else moved[own]
-            extra = self._no_force if force is None else force[own]
-            active = acting[of_theta[own]].any(0) if self.apart else None
-            return self.windows.batch, of_window[own], thetas[of_theta[own]], offset, extra, *self._measured, active
-
-        def part(first: int) -> NDArray[np.float32]:
-            return np.asarray(self._run(*given(first))[0])[: count - first]
-
-        firsts = list(range(0, count, self.lanes))
-        if self.apart and not self.rollouts:
-            self._run.ready(*given(0))  # once, not by every thread
-        done = on_cores(part, firsts) if self.apart else [part(first) for first in firsts]
-        self.rollouts += count
-        return np.concatenate(done).astype(np.float64)
+        return self._through([(self.windows.batch, np.asarray(of_window))], thetas, of_theta, offsets, force)
 
     def run_on(self, thetas: Array, offsets: Array, chains: Windows, chain: NDArray[np.int64]) -> Array:
         """Worlds simulated from window to window, each beginning where the one before it ends, by the same program.
@@ -258,23 +239,38 @@ class Simulator:
         Returns:
             Measured minus simulated motion `[m, K H, 2 nv]`, as of `run`.
         """
-        acting, thetas = self.physics.acting(thetas), np.asarray(thetas, np.float32)
-        parts = [self._part(chains, each) for each in chain.T]
+        return self._through([self._part(chains, own) for own in chain.T], thetas, np.arange(len(thetas)), offsets)
+
+    def _through(
+        self,
+        parts: Sequence[tuple[Batch, NDArray[np.int64]]],
+        thetas: Array,
+        of_theta: NDArray[np.int64],
+        offsets: Array | None,
+        force: NDArray[np.float32] | None = None,
+    ) -> Array:
+        """Errors `[m, K H, 2 nv]` of worlds that go through K windows: of each a batch, and indices `[m]` in it."""
+        acting, thetas, count = self.physics.acting(thetas), np.asarray(thetas, np.float32), len(of_theta)
+        moved = None if offsets is None else np.asarray(offsets, np.float32)
 
         def one(first: int) -> NDArray[np.float32]:
-            own = first + np.minimum(np.arange(self.lanes), min(self.lanes, len(thetas) - first) - 1)
-            active = acting[own].any(0) if self.apart else None
-            offset, (before, anew), found = np.asarray(offsets[own], np.float32), self._measured, []
+            own = first + np.minimum(np.arange(self.lanes), min(self.lanes, count - first) - 1)
+            offset = self._no_offset if moved is None else moved[own]
+            extra = self._no_force if force is None else force[own]
+            active = acting[of_theta[own]].any(0) if self.apart else None
+            (before, anew), found = self._measured, []
             for batch, index in parts:
-                errors, before = self._run(batch, index[own], thetas[own], offset, self._no_force, before, anew, active)
-                found.append(np.asarray(errors)[: len(thetas) - first])
+                given = index[own], thetas[of_theta[own]], offset, extra, before, anew, active
+                errors, before = self._run(batch, *given)
+                found.append(np.asarray(errors)[: count - first])
                 before = np.asarray(before)  # as JAX gives it, it stays on its device: for JAX another program
                 offset, anew = self._no_offset, np.array(False)
             return np.concatenate(found, axis=1)
 
-        firsts = range(0, len(thetas), self.lanes)
-        done = on_cores(one, firsts) if self.apart else [one(first) for first in firsts]
-        self.rollouts += chain.size
+        firsts = range(0, count, self.lanes)
+        alone = len(firsts) if not self.apart else 0 if self.rollouts else 1  # one thread compiles
+        done = [*map(one, firsts[:alone]), *on_cores(one, firsts[alone:])]
+        self.rollouts += count * len(parts)
         return np.concatenate(done).astype(np.float64)
 
     def _part(self, chains: Windows, which: NDArray[np.int64]) -> tuple[Batch, NDArray[np.int64]]:
@@ -286,13 +282,10 @@ class Simulator:
 
 def _packed(world: World) -> jax.Array:
     """A world's state and what its effects remember, as one vector `[D]`: a call takes time for each array."""
-    return ravel_pytree(_own(world))[0].astype(jnp.float32)
+    return ravel_pytree(world.replace(theta=(), fields={}))[0].astype(jnp.float32)
 
 
 def _unpacked(packed: jax.Array, like: World) -> World:
     """The world that `_packed` was made of, with the theta and the model of another."""
-    return like.replace(**ravel_pytree(_own(like))[1](packed))
-
-
-def _own(world: World) -> dict[str, Any]:
-    return {name: value for name, value in vars(world).items() if name not in ("theta", "fields")}
+    bare = like.replace(theta=(), fields={})
+    return ravel_pytree(bare)[1](packed).replace(theta=like.theta, fields=like.fields)

@@ -79,7 +79,8 @@ class Errors:
         self._moved: tuple[Array, Array] | None = None  # start states, and the derivatives there
         self._no_force = np.zeros((len(cut), cut.steps, physics.mj_model.nv), np.float32)
         axes = (0, 0, 0, None, None, None, None)
-        self._run = programs.Kept(jax.vmap(self._one, in_axes=axes), programs.traced_from(physics, "sub-steps"))
+        precise = jax.default_matmul_precision("highest")(self._errors)
+        self._run = programs.Kept(jax.vmap(precise, in_axes=axes), programs.traced_from(physics, "sub-steps"))
 
     def run(self, cut: Windows, factor: int, corrected: bool = True, offsets: Array | None = None) -> Array:
         """With the commands of `cut` at the sub-step h / factor; corrected: velocities lie half of that early."""
@@ -104,10 +105,6 @@ class Errors:
         found = np.stack(on_cores(one, cases))
         self.seconds = (time.monotonic() - began) / len(cases)
         return np.nan_to_num(found, nan=1e3, posinf=1e3, neginf=-1e3)
-
-    def _one(self, own: Batch, *given: jax.Array) -> jax.Array:
-        with jax.default_matmul_precision("highest"):
-            return self._errors(own, *given)
 
     def _errors(
         self,

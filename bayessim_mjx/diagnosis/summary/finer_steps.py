@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting import windows
-from bayessim_mjx.diagnosis.fitting.discretisation import contacts, refined
+from bayessim_mjx.diagnosis.fitting.discretisation import refined
+from bayessim_mjx.diagnosis.fitting.simulable import contacts
 from bayessim_mjx.diagnosis.fitting.simulator import FAR, Simulator, physics_of
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.physics import staggered
