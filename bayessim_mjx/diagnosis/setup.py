@@ -43,7 +43,6 @@ Array = NDArray[np.float64]
 
 # of a first answer, for any robot; how often it differs from the answer of the whole search was not counted
 QUICK = Settings(screened=12, iterations=8)
-SHIFT_FACTOR = 4  # finest sub-steps for the estimate of a command shift, as a factor on the coarsest stable ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +238,7 @@ def _shift(
     """By how much commands act later or earlier than the logs say."""
     if step.errors is None or not step.errors.physics.mj_model.nu:
         return None
-    factor = min(step.factor, SHIFT_FACTOR * step.errors.first)
+    factor = min(step.factor, step.errors.finest)
     return command_shift.estimate(
         step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
     )

@@ -20,11 +20,10 @@ from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 
 Array = NDArray[np.float64]
-STEP = 0.005  # of the range: finite differences
-# of its value, how far a number is taken to be off at most where a scale for it is asked for: its range may be wide
-SPAN = 0.4
-# Standard deviations from a value whose accuracy is stated, beyond which nothing is that value: 1 in 16 000. Of what a
-# motor's gain and all masses do alike, logs alone would let masses go anywhere.
+STEP = 0.005  # of the range: first finite differences, before `Fit.steps` knows the columns; not counted
+SPAN = 0.4  # of its value, as far as a number is taken to be off where a scale is needed; a rule of thumb
+# Standard deviations from a value whose accuracy is stated, beyond which nothing is that value: 1 in 16 000 of Gaussian
+# errors, a rule of thumb. Of what a motor's gain and all masses do alike, logs alone would let masses go anywhere.
 FARTHEST = 4.0
 
 

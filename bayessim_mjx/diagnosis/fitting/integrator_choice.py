@@ -24,11 +24,11 @@ from bayessim_mjx.diagnosis.fitting.scales import mass_matrix
 from bayessim_mjx.diagnosis.fitting.simulable import contacts
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics import controllers
+from bayessim_mjx.physics.timestep import STAGES
 
 Array = NDArray[np.float64]
 # (robot's physics, first=coarsest stable factor, cheaper=see `Errors`) -> (the windows, the error of the time step)
 Measured = Callable[..., tuple[Any, Discretisation]]
-STAGES = 4  # of Runge and Kutta's method, each as dear as a step
 TOO_LONG = "the model's time step shows beside the noise, and in the time given nothing finer can be searched with"
 EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST"))
 
@@ -146,7 +146,7 @@ def choose(
         return plain
     if contacts(own) or int(own.mj_model.opt.integrator) == RK4:
         return plain
-    if plain.worth.errors and STAGES * plain.worth.errors.seconds >= left:
+    if plain.worth.errors and (len(STAGES) + 1) * plain.worth.errors.seconds >= left:
         return dataclasses.replace(plain, better=(TOO_LONG,))
     other = _integrated(robot, RK4)
     physics = other.physics(dt)

@@ -40,7 +40,7 @@ class Rules:
         angle: rad or m, standard deviation of a position at a log's first row; speed: rad/s or m/s, of a velocity.
         shares: of typical accelerations, that the model may lack; the most likely one of each log is taken.
         passes: smoothed start states are filtered from again.
-        second: s, in which a start state has to show; told: of its standard deviation that may be left after that.
+        second: s, in which a start state has to show; known: of its standard deviation that may be left after that.
         most: share of the logs, from which on all of them is filtered.
         least: rad, rad/s, as precise as the model is taken to be.
     """

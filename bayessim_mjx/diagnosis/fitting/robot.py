@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from bayessim_mjx.env import Task
 
 TRAINING = ("frequency", "observations", "actions", "sim_params")
-# The default range of a scale: errors of 30 %, the least accurate data sheet that is expected (`data_sheet.ACCURACY`),
-# lie within it but for 1 in 100. What is known of a number is its prior; the range only ends it.
+# The default range of a scale: of Gaussian errors of 30 % (`data_sheet.ACCURACY`, the least accurate data sheet that is
+# expected: a rule of thumb) all but 1 in 100 lie within it. What is known of a number is its prior; the range ends it.
 WITHIN = (0.3, 2.0)
 # and of dry friction, which falls by half and more as a drive warms up or wears in: more of it can be an effect
 # (Coulomb friction), less can be nothing else. Not counted
 RUBS = (0.2, 1.2)
-# Iterations of Newton's solver and of its line search. Dry friction alone is solved to single precision by 4 and 6 (six
-# joints, half a second: the same to 1e-7 rad as by 100 and 50, at half the time); worlds in one call wait for the last.
+# Iterations of Newton's solver and of its line search. Dry friction alone is solved to single precision by 4 and 6.
+# Measured with six joints, half a second: the same to 1e-7 rad as by 100 and 50, at half the time.
 ROUNDS = 8
 _IMPLICIT = int(mujoco.mjtIntegrator.mjINT_IMPLICIT)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)

@@ -20,8 +20,9 @@ from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.physics import staggered
 
 Array = NDArray[np.float64]
-FINER = 4  # times as many steps as the fit took: a quarter of an error of first order is left, and extrapolated
-TOLD = 2.0  # standard deviations without it, from where on a parameter's shift is told
+# times as many steps as the fit took: a quarter of an error of first order is left, and extrapolated (Richardson 1911)
+FINER = 4
+FAR_OFF = 2.0  # standard deviations, beyond which a sentence gives a parameter's shift: a rule of thumb
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class AtFinerSteps:
         parts = [
             f"{c.name} {value + shift:.3g} in place of {value:.3g} {c.unit}".rstrip()
             for c, value, shift, sd in each
-            if c.name in own and abs(shift) > TOLD * sd
+            if c.name in own and abs(shift) > FAR_OFF * sd
         ]
         text = "the time step is in the parameters: at ever finer steps they would be"
         return [f"{text} {', '.join(parts)} (counted in their intervals)"] if parts else []

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting import windows
+from bayessim_mjx.diagnosis.fitting.simulator import FAR
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import KNOWN, Model, of_noise, systematic
@@ -22,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How much of whole logs is simulated, and what is told of it."""
+    """How much of whole logs is simulated, and when their errors are compared. Rules of thumb, not counted."""
 
     # at most
     logs: int = 8
@@ -33,7 +34,6 @@ class Rules:
     clear: float = 3.0
     part: float = 0.1
     least: int = 2  # windows that a log must be predictable for
-    lost: float = 999.0  # the simulator's mark of what is not finite
 
 
 RULES = Rules()
@@ -134,7 +134,7 @@ def _simulated(
     thetas, offsets = (np.concatenate(each) for each in zip(*drawn, strict=True))
     chain = np.repeat(np.arange(len(chains)).reshape(len(first), -1), len(thetas) // len(first), axis=0)
     raw = fitter.simulator.run_on(thetas, offsets, chains, chain)
-    raw[np.abs(raw) >= RULES.lost] = np.nan
+    raw[np.abs(raw) >= FAR] = np.nan
     raw = raw.reshape(len(first), -1, *raw.shape[1:])
     return np.asarray(raw[..., fitter.used] / fitter.sigma)
 
