@@ -6,7 +6,6 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,7 +206,7 @@ def _measured(
     usable: Sequence[Log],
     group: str | None,
     use_qvel: bool,
-    limit: Array | None = None,
+    limit: Array | None,
     first: int = 1,
     cheaper: Errors | None = None,
 ) -> tuple[Callable[..., Windows], discretisation.Discretisation]:
@@ -215,15 +214,14 @@ def _measured(
 
     Args:
         limit: `[nv]`, the tolerance: steps are made finer than the budget allows until they are worth less; None: they
-            are not, and `first` is 1.
+            are not.
         first: the coarsest factor on the sub-steps that is stable: as many windows fewer are looked at.
         cheaper: see `Errors`.
     """
     for share in CUTTING.shorter:
         cuts = windows_of(own, usable, group, use_qvel, share * CUTTING.window, first)
         factors = [finest(own, len(cuts(1)), cuts(1).steps, budget) for budget in (1.0, CUTTING.dearest)]
-        asked = {"first": first, "limit": limit, "utmost": factors[1], "cheaper": cheaper}
-        more: dict[str, Any] = {} if limit is None else asked
+        more = {"first": first, "limit": limit, "utmost": factors[1], "cheaper": cheaper}
         step = discretisation.measure(own, cuts, usable, factors[0], **more)
         known = np.isfinite(step.sigma)
         worth = float(np.median(step.floor[known] / step.sigma[known]))

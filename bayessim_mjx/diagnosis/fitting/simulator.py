@@ -88,7 +88,6 @@ class Simulator:
         self.lanes = lanes or (CALL.cpu_lanes if on_cpu else CALL.lanes)
         self.apart = on_cpu
         self.nv = int(physics.mj_model.nv)
-        self.channels = 2 * self.nv
         self.rollouts = 0
         self._run = programs.Kept(self._many, programs.traced_from(physics, "windows"))
         self._no_offset = np.zeros((self.lanes, 2 * self.nv), np.float32)

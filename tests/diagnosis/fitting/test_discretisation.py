@@ -166,14 +166,14 @@ def test_where_nothing_touches_there_are_no_contacts():
 def test_windows_get_shorter_where_contacts_make_the_step_worth_many_noises(monkeypatch, touching: bool, steps: int):
     """The step's worth grows with the window, 8.3 noises after 50 steps; without contacts finer steps mend it."""
 
-    def worth(physics, cuts, logs, most):
+    def worth(physics, cuts, logs, most, **more):
         sigma = np.ones(2)
         return SimpleNamespace(sigma=sigma, floor=sigma * cuts(1).steps / 6)
 
     monkeypatch.setattr(discretisation, "measure", worth)
     monkeypatch.setattr(setup, "contacts", lambda physics: touching)
     pushed = logs(MASS, lambda i, t, q, v: np.sin(3 * t + i))
-    cuts, step = _measured(the(MASS).physics(PERIOD), pushed, None, False)
+    cuts, step = _measured(the(MASS).physics(PERIOD), pushed, None, False, None)
     assert cuts(1).steps == steps and step.floor[0] == steps / 6
 
 
