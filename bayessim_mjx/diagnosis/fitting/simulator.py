@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
 from bayessim_mjx import programs
@@ -94,7 +93,7 @@ class Simulator:
         self._no_force = jnp.asarray(np.zeros((self.lanes, windows.steps, self.nv), np.float32))
         nominal = jnp.asarray(np.asarray(physics.space.nominal, np.float32))
         size = jax.eval_shape(lambda theta: _packed(physics.unseen(theta, None, None, {})), nominal).size
-        self._measured = jnp.asarray(np.zeros((self.lanes, size), np.float32)), np.array(True)
+        self._measured: tuple[Any, Any] = jnp.asarray(np.zeros((self.lanes, size), np.int32)), np.array(True)
 
     @property
     def programs(self) -> int:
@@ -257,7 +256,8 @@ class Simulator:
             offset = self._no_offset if moved is None else moved[own]
             extra = self._no_force if force is None else force[own]
             active = acting[of_theta[own]].any(0) if self.apart else None
-            (before, anew), found = self._measured, []
+            found: list[NDArray[np.float32]] = []
+            before, anew = self._measured
             for batch, index in parts:
                 given = index[own], thetas[of_theta[own]], offset, extra, before, anew, active
                 errors, before = self._run(batch, *given)
@@ -280,11 +280,20 @@ class Simulator:
 
 
 def _packed(world: World) -> jax.Array:
-    """A world's state and what its effects remember, as one vector `[D]`: a call takes time for each array."""
-    return ravel_pytree(world.replace(theta=(), fields={}))[0].astype(jnp.float32)
+    """The bits of a world's state and of what its effects remember, `[D]`: a call takes time for each array."""
+    leaves = jax.tree.leaves(world.replace(theta=(), fields={}))
+    return jnp.concatenate([_cast(jnp.asarray(x), jnp.dtype("int32")).ravel() for x in leaves])
 
 
 def _unpacked(packed: jax.Array, like: World) -> World:
     """The world that `_packed` was made of, with the theta and the model of another."""
-    bare = like.replace(theta=(), fields={})
-    return ravel_pytree(bare)[1](packed).replace(theta=like.theta, fields=like.fields)
+    leaves, tree = jax.tree.flatten(like.replace(theta=(), fields={}))
+    parts = jnp.split(packed, np.cumsum([x.size for x in leaves])[:-1])
+    each = [_cast(part.reshape(x.shape), x.dtype) for part, x in zip(parts, leaves, strict=True)]
+    return jax.tree.unflatten(tree, each).replace(theta=like.theta, fields=like.fields)
+
+
+def _cast(x: jax.Array, to: Any) -> jax.Array:
+    """The same bits, where both have 32."""
+    same = x.dtype.itemsize == to.itemsize
+    return jax.lax.bitcast_convert_type(x, to) if same else x.astype(to)
