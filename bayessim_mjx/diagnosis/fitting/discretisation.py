@@ -213,8 +213,7 @@ def measure(
     one, two = settle(coarse - mid), settle(mid - fine)
     gain = _gain(one / sigma, two / sigma)
     truth = fine if touching else fine + (fine - mid) / max(gain - 1, 1.0)
-    # what all halvings change, in what the first one does: alike, or with contacts each in a way of its own
-    worth = _size(one, touching) * (1 / np.sqrt(1 - gain**-2.0) if touching else gain / (gain - 1))
+    worth = _size(one, touching) * _all(gain, touching)
     at = {first * f: worth / gain ** np.log2(f) for f in (*RULES.factors, *RULES.more)}
     settled = _size(settle(plain - truth), touching)
     clean = np.array([noise_free(logs, i) for i in physics.mj_model.jnt_qposadr[physics.mj_model.dof_jntid]])
@@ -246,6 +245,11 @@ def _gain(one: Array, two: Array) -> float:
     size = [np.sqrt(np.sum(e**2, (1, 2))) for e in (one, two)]
     ratio = np.median(size[0] / np.maximum(size[1], 1e-12))
     return float(np.clip(ratio, 1.1, 4.0))
+
+
+def _all(gain: float, touching: bool) -> float:
+    """What all halvings change, in what the first one does: alike, or with contacts each in a way of its own."""
+    return float(1 / np.sqrt(1 - gain**-2.0)) if touching else gain / (gain - 1)
 
 
 def _choose(error: dict[int, float], gain: float, first: int = 1) -> int:
