@@ -220,9 +220,8 @@ def _measured(
     """
     for share in CUTTING.shorter:
         cuts = windows_of(own, usable, group, use_qvel, share * CUTTING.window, first)
-        factors = [finest(own, len(cuts(1)), cuts(1).steps, budget) for budget in (1.0, CUTTING.dearest)]
-        more = {"first": first, "limit": limit, "utmost": factors[1], "cheaper": cheaper}
-        step = discretisation.measure(own, cuts, usable, factors[0], **more)
+        most, utmost = (finest(own, len(cuts(1)), cuts(1).steps, budget) for budget in (1.0, CUTTING.dearest))
+        step = discretisation.measure(own, cuts, usable, most, first=first, limit=limit, utmost=utmost, cheaper=cheaper)
         known = np.isfinite(step.sigma)
         worth = float(np.median(step.floor[known] / step.sigma[known]))
         if worth < CUTTING.lottery or not contacts(own) or cuts(1).steps <= CUTTING.shortest_window:
