@@ -63,7 +63,7 @@ class Kept:
         def flat(*leaves: Any) -> Any:
             return self.function(*jax.tree.unflatten(tree, leaves))
 
-        return jax.jit(flat, compiler_options=_options())
+        return jax.jit(flat, compiler_options=compiler_options())
 
     def _from_disk(self, name: str, leaves: list[Any], tree: Any) -> Any:
         folder = cache.folder()
@@ -79,7 +79,7 @@ class Kept:
                 _write(path, bytes(exported.serialize()))
             except (ValueError, NotImplementedError, OSError):  # a custom call that JAX does not promise to keep
                 return own
-        return jax.jit(exported.call, compiler_options=_options())
+        return jax.jit(exported.call, compiler_options=compiler_options())
 
 
 def traced_from(physics: Physics, *more: Any) -> str | None:
@@ -102,22 +102,6 @@ def source_of(of: type) -> str | None:
         return _digest([Path(inspect.getfile(of)).read_text()])
     except (OSError, TypeError):
         return None
-
-
-@functools.cache
-def _options() -> dict[str, Any]:
-    """`compiler_options` without LLVM's expensive passes, which gain nothing here.
-
-    Measured with a pendulum and 33 effects: 12.4 CPU seconds to trace and compile are 11.4 (by RK4 without effects 5.7
-    are 5.2), and its windows take 1.005 times as long, to the same bits.
-    """
-    known = compiler_options()
-    quick = known | {"xla_llvm_disable_expensive_passes": True}
-    try:
-        jax.jit(lambda x: x + 1).lower(0.0).compile(quick)
-    except jax.errors.JaxRuntimeError:
-        return known
-    return quick if known else {}
 
 
 @functools.cache
