@@ -48,11 +48,6 @@ class Kept:
         leaves, tree = jax.tree.flatten(args)
         return self._program(leaves, tree)(*leaves)
 
-    def ready(self, *args: Any) -> None:
-        """Compile for these arguments, without a call."""
-        leaves, tree = jax.tree.flatten(args)
-        self._program(leaves, tree).lower(*leaves).compile()
-
     def _program(self, leaves: list[Any], tree: Any) -> Any:
         shapes = tuple((np.shape(x), str(jax.dtypes.canonicalize_dtype(np.result_type(x)))) for x in leaves)
         if (tree, shapes) not in self._known:

@@ -42,7 +42,6 @@ def test_a_second_process_need_not_trace(own_cache):
     assert len(traced) == 1 and len(list(own_cache.iterdir())) == 1
     second, again = counted()
     kept = programs.Kept(second, "key")
-    kept.ready(*GIVEN)
     assert kept(*GIVEN)["y"] == pytest.approx([6.0, 24.0]) and kept(*GIVEN)["z"] is None
     assert not again and kept.count == 1
 

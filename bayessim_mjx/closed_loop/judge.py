@@ -211,9 +211,8 @@ def replay(logs: Sequence[Log], nominal: Physics, corrected: Physics) -> dict[st
         raise UserError(f"--real: the shortest log with a controller holds {length + 1} control steps of {dt:.3g} s")
     rms = {}
     for name, physics in (("nominal", nominal), ("corrected", corrected)):
-        cut = windows.cut(
-            declared, physics.mj_model, dt, physics.substeps, length, limit=len(declared), first_only=True
-        )
+        starts = [(i, 0) for i in range(len(declared))]
+        cut = windows.cut(declared, physics.mj_model, dt, physics.substeps, length, limit=len(starts), starts=starts)
         error = Simulator(physics, cut, lanes=len(cut)).run(physics.space.nominal[None].astype(np.float64))
         rms[name] = np.sqrt(np.mean(error[0, ..., : physics.mj_model.nv] ** 2, axis=(0, 1)))
     names = Channels.of(nominal.mj_model).qvel

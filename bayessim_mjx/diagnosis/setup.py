@@ -6,13 +6,12 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import tolerance
-from bayessim_mjx.diagnosis.equation_error import proposals
+from bayessim_mjx.diagnosis.equation_error import inverse_dynamics_check
 from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.fitting import (
     candidates,
@@ -20,12 +19,12 @@ from bayessim_mjx.diagnosis.fitting import (
     discretisation,
     integrator_choice,
     observation,
-    pruned_model,
     scales,
 )
-from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, finest, most_windows, seconds_of, windows_of
+from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, at_most, finest, most_windows, windows_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
-from bayessim_mjx.diagnosis.fitting.robot import Robot
+from bayessim_mjx.diagnosis.fitting.robot import Robot, pruned
+from bayessim_mjx.diagnosis.fitting.simulable import contacts
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
@@ -33,6 +32,7 @@ from bayessim_mjx.diagnosis.logcheck import gate, noise
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.search_state import Settings
+from bayessim_mjx.effects.support.motion import AROUND
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import resample
 from bayessim_mjx.physics import Physics
@@ -42,7 +42,6 @@ Array = NDArray[np.float64]
 
 # of a first answer, for any robot; how often it differs from the answer of the whole search was not counted
 QUICK = Settings(screened=12, iterations=8)
-SHIFT_FACTOR = 4  # finest sub-steps for the estimate of a command shift, as a factor on the coarsest stable ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +89,7 @@ class _Checked:
     """Logs that passed the gate, and the robot and the control period that they are compared with.
 
     Attributes:
-        robot: as it is simulated beside these logs (`pruned_model`); dt: control period, s.
+        robot: as it is simulated beside these logs (`robot.pruned`); dt: control period, s.
         period: s between rows, the median of all logs.
         look: what the logs show before any simulation; notes: warnings so far.
     """
@@ -152,11 +151,12 @@ def prepare(
     physics = physics_of(timed.robot, checked.dt, stack)
     cut = timed.cut(physics, request.quick)
     base = candidates.base_coordinates(timed.robot.space, timed.robot.accuracy, timed.robot.assumed)
-    led = proposals.lead(candidates.enumerate_candidates(physics), checked.look)
+    led = inverse_dynamics_check.lead(candidates.enumerate_candidates(physics), checked.look)
     allowed = judge(cut.sigma_q)
     untried = [f"not tried: {text}" for text in left_out]
     warnings = [*checked.notes, *timed.notes, *timed.warnings, *untried, *_few_conditions(cut)]
-    settings = request.settings or _settings(robot, request.quick)
+    own = Settings(screened=24) if robot.mj_model.nv > CUTTING.many else Settings()
+    settings = request.settings or (QUICK if request.quick else own)
     return Setup(
         robot=timed.robot,
         physics=physics,
@@ -177,20 +177,22 @@ def prepare(
 def _checked(robot: Robot, logs: Sequence[Log], request: Request, looked: Callable[[Look], None]) -> _Checked:
     """The logs after the gate, cut where they begin to be usable, and their notes."""
     dt, notes = control_period(robot, logs), [*request.notes]
-    found, look = proposals.checked(logs, robot, dt, notes, looked)
-    beginnings, shorter = observation.shortened(found.demand(), seconds_of(robot.mj_model.nv, request.quick))
+    found, look = inverse_dynamics_check.checked(logs, robot, dt, notes, looked)
+    seconds = at_most(robot.mj_model.nv, request.quick) * (CUTTING.window + AROUND)  # that all windows hold together
+    beginnings, shorter = observation.shortened(found.demand(), seconds)
     found = found.of_logs(observation.completed(beginnings, robot.mj_model))
     notes += [*found.warnings, *shorter, *(f"{text} (found, not assumed)" for text in found.findings)]
     notes += [] if noise.repeats(found.usable) else [noise.ONCE]
     period = float(np.median([log.period for log in logs]))
-    return _Checked(pruned_model.pruned(robot, found.usable, dt), dt, period, found, look, tuple(notes))
+    return _Checked(pruned(robot, found.usable, dt), dt, period, found, look, tuple(notes))
 
 
 def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | None, budget: Budget) -> _Timed:
     """How finely the simulator has to step, and how far commands are shifted; limit: `[nv]`, the tolerance."""
     usable, dt = checked.gate.usable, checked.dt
     measured = functools.partial(_measured, usable=usable, group=group, use_qvel=checked.gate.use_qvel, limit=limit)
-    steps = integrator_choice.choose(checked.robot, dt, usable, measured, functools.partial(_affordable, budget))
+    left = (budget.seconds - budget.spent) / CUTTING.simulations  # s for one simulation of all windows
+    steps = integrator_choice.choose(checked.robot, dt, usable, measured, left)
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
     late = [] if shift is None else shift.notes(checked.period)
@@ -199,25 +201,12 @@ def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | No
     return _Timed(step.robot(steps.robot), clocked, cuts, step, tuple(notes), tuple(steps.warnings()))
 
 
-def _affordable(budget: Budget, seconds: float) -> bool:
-    """Whether a search whose simulations of all windows take so many seconds each would end in time."""
-    return CUTTING.simulations * seconds < budget.seconds - budget.spent
-
-
-def _settings(robot: Robot, quick: bool = False) -> Settings:
-    """Budgets for the robot's size."""
-    if quick:
-        return QUICK
-    big = robot.mj_model.nv > CUTTING.many
-    return Settings(screened=24) if big else Settings()
-
-
 def _measured(
     own: Physics,
     usable: Sequence[Log],
     group: str | None,
     use_qvel: bool,
-    limit: Array | None = None,
+    limit: Array | None,
     first: int = 1,
     cheaper: Errors | None = None,
 ) -> tuple[Callable[..., Windows], discretisation.Discretisation]:
@@ -225,19 +214,17 @@ def _measured(
 
     Args:
         limit: `[nv]`, the tolerance: steps are made finer than the budget allows until they are worth less; None: they
-            are not, and `first` is 1.
+            are not.
         first: the coarsest factor on the sub-steps that is stable: as many windows fewer are looked at.
         cheaper: see `Errors`.
     """
     for share in CUTTING.shorter:
         cuts = windows_of(own, usable, group, use_qvel, share * CUTTING.window, first)
-        factors = [finest(own, len(cuts(1)), cuts(1).steps, budget) for budget in (1.0, CUTTING.dearest)]
-        asked = {"first": first, "limit": limit, "utmost": factors[1], "cheaper": cheaper}
-        more: dict[str, Any] = {} if limit is None else asked
-        step = discretisation.measure(own, cuts, usable, factors[0], **more)
+        most, utmost = (finest(own, len(cuts(1)), cuts(1).steps, budget) for budget in (1.0, CUTTING.dearest))
+        step = discretisation.measure(own, cuts, usable, most, first=first, limit=limit, utmost=utmost, cheaper=cheaper)
         known = np.isfinite(step.sigma)
         worth = float(np.median(step.floor[known] / step.sigma[known]))
-        if worth < CUTTING.lottery or not discretisation.contacts(own) or cuts(1).steps <= CUTTING.shortest_window:
+        if worth < CUTTING.lottery or not contacts(own) or cuts(1).steps <= CUTTING.shortest_window:
             break
     return cuts, step
 
@@ -248,7 +235,7 @@ def _shift(
     """By how much commands act later or earlier than the logs say."""
     if step.errors is None or not step.errors.physics.mj_model.nu:
         return None
-    factor = min(step.factor, SHIFT_FACTOR * step.errors.first)
+    factor = min(step.factor, step.errors.finest)
     return command_shift.estimate(
         step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
     )

@@ -48,8 +48,7 @@ def rigs(seeds: Sequence[int], systems: Sequence[str] = SYSTEMS, effects: Sequen
 
 def judged(rig: Rig) -> dict[str, Any]:
     """One rig's row."""
-    from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check
-    from bayessim_mjx.diagnosis.equation_error.proposals import proposed
+    from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check, proposed
 
     model, logs = record(rig)
     began = time.process_time()

@@ -133,7 +133,8 @@ def _forward(sums: Sums, known: Sequence[Term], terms: Sequence[Term], start: Se
             break
         (best, score), *others = tried
         gain = float(score.sum() - density.sum())
-        if gain < threshold * len(best) or not _everywhere(score - density):
+        each = score - density
+        if gain < threshold * len(best) or (len(each) > 1 and gain <= each.max()):  # or by one part of the data alone
             break
         after = fitting.fit(sums, [*known, *own, *best])
         if not any(_matters(sums, after, t) for t in best):
@@ -168,11 +169,6 @@ def _tried(
     )
     held = [(m, fitting.score(sums, [*kept, *m], start=now.variance)) for m, _ in good[: CRITERIA.looked]]
     return sorted(held, key=lambda p: -(p[1].sum() - 0.5 * sum(t.count for t in p[0]) - threshold * (len(p[0]) - 1)))
-
-
-def _everywhere(gains: Array) -> bool:
-    """Not by one part of the data alone."""
-    return len(gains) < 2 or float(gains.sum() - gains.max()) > 0
 
 
 def _matters(sums: Sums, after: Fit, term: Term) -> bool:

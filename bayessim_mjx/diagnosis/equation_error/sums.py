@@ -141,17 +141,8 @@ def layout_of(model: mujoco.MjModel) -> Layout:
     return Layout(len(rigid_body.moving_bodies(model)), model.nv, shared)
 
 
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """One log: x `[T, nv, size]`, rows `[nv, T]` to be used, and how many independent ones a row is."""
-
-    x: Array
-    rows: Mask
-    share: float
-
-
-def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Array) -> Columns:
-    """All columns of one log.
+def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Array) -> tuple[Array, Mask, float]:
+    """(all columns of one log `[T, nv, size]`, rows `[nv, T]` to be used, how many independent ones a row is).
 
     Args:
         source: `[nv]`, see `sources`; slow: `[nv]`, speeds at which dry friction turns over.
@@ -177,7 +168,7 @@ def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Arra
         if dof is not None and source[dof] in of:
             x[:, dof, layout.drive(i)] = filtered(model.actuator_gear[i, 0] * of[source[dof]][:, i], log, moved)
     rows = np.stack([moved.moving(v) & (source[v] != "") for v in range(model.nv)])
-    return Columns(x, rows, moved.share)
+    return x, rows, moved.share
 
 
 def _zeros(model: mujoco.MjModel, moved: Motion) -> dict[int, Array]:
@@ -203,13 +194,13 @@ def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
     grams, rows = [], []
     parts = BUDGET.parts if len(short) < BUDGET.folds else 1
     for log in short:
-        own = columns(log, model, source, SLOW * top + 1e-12)
-        for part in np.array_split(np.arange(own.rows.shape[1]), parts):
+        x, moving, share = columns(log, model, source, SLOW * top + 1e-12)
+        for part in np.array_split(np.arange(len(x)), parts):
             gram = np.zeros((model.nv, layout.size, layout.size))
             count = np.zeros(model.nv)
             for v in range(model.nv):
-                x = own.x[part[own.rows[v, part]], v]
-                gram[v], count[v] = own.share * x.T @ x, own.share * len(x)
+                own = x[part[moving[v, part]], v]
+                gram[v], count[v] = share * own.T @ own, share * len(own)
             grams.append(gram)
             rows.append(count)
     period = float(np.median([log.period for log in logs]))

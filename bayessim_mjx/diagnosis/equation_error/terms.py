@@ -26,8 +26,9 @@ Reader = Callable[[Array], Mapping[str, float]]  # coefficients -> parameters of
 class Ranges:
     """What is taken for possible, and how well drives and mountings are known before anything is logged.
 
-    Torque constants and current loops to a fifth, zeros of joints and the upright of a base to three degrees (rules
-    of thumb): a gain of .4 or a zero that is 7 degrees off has to show more than rotor inertia that a model leaves out.
+    Torque constants and current loops to a fifth, zeros of joints and the upright of a base to three degrees. These
+    are rules of thumb: a gain of .4 or a zero that is 7 degrees off has to show more than rotor inertia that a model
+    leaves out.
     """
 
     gain: tuple[float, float] = (0.2, 3.0)

@@ -20,11 +20,10 @@ from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 
 Array = NDArray[np.float64]
-STEP = 0.005  # of the range: finite differences
-# of its value, how far a number is taken to be off at most where a scale for it is asked for: its range may be wide
-SPAN = 0.4
-# Standard deviations from a value whose accuracy is stated, beyond which nothing is that value: 1 in 16 000. Of what a
-# motor's gain and all masses do alike, logs alone would let masses go anywhere.
+STEP = 0.005  # of the range: first finite differences, before `Fit.steps` knows the columns; not counted
+SPAN = 0.4  # of its value, as far as a number is taken to be off where a scale is needed; a rule of thumb
+# Standard deviations from a value whose accuracy is stated, beyond which nothing is that value: 1 in 16 000 of Gaussian
+# errors, a rule of thumb. Of what a motor's gain and all masses do alike, logs alone would let masses go anywhere.
 FARTHEST = 4.0
 
 
@@ -184,14 +183,12 @@ def _candidate(effect: Effect, where: str, blocks: Sequence[Block]) -> Candidate
         name = own[0].name if len(own) == 1 else f"all.{effect.name}.{q.name}"
         coordinates.append(Coordinate(name, index, own[0].nominal, low, high, unit=own[0].unit))
     believed = zip(coordinates, effect.quantities, strict=True)
-    shown = tuple(_stated(c) if q.stated else replace(c, precision=shrink(c)) for c, q in believed)
+    shown = tuple(
+        replace(c, precision=STATED**2 * shrink(c), stated=True) if q.stated else replace(c, precision=shrink(c))
+        for c, q in believed
+    )
     shapes = tuple(q.shape for q in effect.quantities)
     return Candidate(effect.name, where, effect.kind, shown, shapes, _probes(effect, shown))
-
-
-def _stated(c: Coordinate) -> Coordinate:
-    """As a data sheet states it (`Quantity.stated`)."""
-    return replace(c, precision=(STATED / (c.high - c.low)) ** 2, stated=True)
 
 
 def shrink(c: Coordinate) -> float:

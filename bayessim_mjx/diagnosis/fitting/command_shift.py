@@ -114,7 +114,7 @@ def estimate(errors: Errors, late: Shifted, sigma: Array, force: Array, factor: 
         late: windows with shifted commands, at the sub-steps of `factor`.
         sigma: `[2 nv]`, noise; infinite where nothing was measured.
         force: `[nv]`, typical size of what acts on each joint.
-        factor: sub-steps per timestep of the model, at most `errors.most`.
+        factor: sub-steps per timestep of the model, at most `errors.finest`.
     """
     cut, model = errors.cut, _Model(errors, late, sigma, force, factor)
     precision = np.append(0.0, np.full(model.size - 1, RULES.prior**-2))

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayessim_mjx.diagnosis.fitting import windows
-from bayessim_mjx.effects.support.motion import AROUND
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Physics
 
@@ -87,9 +86,14 @@ def windows_of(
 
 def most_windows(physics: Physics, length: int, quick: bool = False) -> int:
     """Most windows of so many control steps that are simulated at once."""
-    nv = physics.mj_model.nv
-    budget = CUTTING.budget if nv <= CUTTING.many else CUTTING.budget // 2
-    return min(at_most(nv, quick), max(CUTTING.fewest, budget // (length * physics.substeps)))
+    return min(
+        at_most(physics.mj_model.nv, quick), max(CUTTING.fewest, _budget(physics) // (length * physics.substeps))
+    )
+
+
+def _budget(physics: Physics) -> int:
+    """Sub-steps of one simulation of all windows."""
+    return CUTTING.budget if physics.mj_model.nv <= CUTTING.many else CUTTING.budget // 2
 
 
 def at_most(nv: int, quick: bool = False) -> int:
@@ -97,12 +101,6 @@ def at_most(nv: int, quick: bool = False) -> int:
     return CUTTING.fewest if quick else next(n for dofs, n in CUTTING.limits if nv <= dofs)
 
 
-def seconds_of(nv: int, quick: bool = False) -> float:
-    """s that all windows of such a robot hold together, with what effects remember before each."""
-    return at_most(nv, quick) * (CUTTING.window + AROUND)
-
-
 def finest(physics: Physics, count: int, length: int, share: float = 1.0) -> int:
     """How many times the sub-steps `share` budgets allow when at most half of `count` windows are given up for it."""
-    budget = int(share * (CUTTING.budget if physics.mj_model.nv <= CUTTING.many else CUTTING.budget // 2))
-    return max(1, budget // (length * physics.substeps * max(CUTTING.fewest, (count + 1) // 2)))
+    return max(1, int(share * _budget(physics)) // (length * physics.substeps * max(CUTTING.fewest, (count + 1) // 2)))

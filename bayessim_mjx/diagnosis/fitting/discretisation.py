@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting import quadratic
 from bayessim_mjx.diagnosis.fitting.robot import Robot
+from bayessim_mjx.diagnosis.fitting.simulable import contacts
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
@@ -276,8 +277,3 @@ def _size(error: Array, touching: bool) -> Array:
     each = np.mean(error**2, axis=1)
     usual = np.median(each, axis=0)
     return np.asarray(np.sqrt(usual if touching else np.mean(np.minimum(each, quadratic.RULES.far**2 * usual), axis=0)))
-
-
-def contacts(physics: Physics) -> bool:
-    """Whether anything can touch."""
-    return bool(physics.template._impl.contact.dist.shape[0])

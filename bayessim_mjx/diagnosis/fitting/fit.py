@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 # noise sd, rms by which a finite difference changes the residuals: rounding is 2e-4 to 6e-4; one noise was too far
 # where friction of the model's own is fitted beside a law of friction (their sum came 8 % too large)
 CHANGE = 0.3
-REACH = 16.0  # by which its step may be longer or shorter than that of a column of which nothing is known
+REACH = 16.0  # by which its step may be longer or shorter than the first one (`candidates.STEP`); not counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,8 @@ class Fit:
     Attributes:
         coordinates: free ones; values: `[k]`; offsets: `[W, s]` of the start states.
         r: whitened residuals `[W, n]`; A: `[W, n, k]`, minus their derivatives; B: `[W, n, s]` by the start states.
-        weight: `[W]`; cost: weighted, priors included; damping: Levenberg's, of the next step.
+        weight: `[W]`; cost: weighted, priors included; damping: Levenberg's, of the next
+            step; the first one is a rule of thumb.
         promise: by how much the next step would lower the cost if the model were linear; history: costs, step by step.
         doubt: squared misfit per independent number in the data, by which priors of stated parameters are multiplied.
         reach: `[W]`, share of their own steps that the start states make: less after one that did a window harm.

@@ -22,10 +22,10 @@ from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 
 __all__ = ["Fit", "Fitter", "weights"]
 Array = NDArray[np.float64]
-# Of the largest curvature by ranges, by which each number is damped. Of 0, .003, .01, .03, .1, .3 and 1, from four far
-# starts of a payload and a bias, 2, 2, 4, 2, 3, 4 and 3 arrive; 1 finds no limit beside play (3240de4)
+# Of the largest curvature by ranges, by which each number is damped. Measured at 3240de4: of 0, .003, .01, .03, .1, .3
+# and 1, from four far starts of a payload and a bias, 2, 2, 4, 2, 3, 4 and 3 arrive; 1 finds no limit beside play
 DAMPED = 0.01
-NUMBERS = 2  # independent ones that one channel of one window holds: a missing force shows as a smooth curve
+NUMBERS = 2  # independent ones that a window's channel holds: a missing force is a smooth curve; a rule of thumb
 
 
 class Fitter:

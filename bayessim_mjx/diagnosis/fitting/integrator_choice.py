@@ -18,15 +18,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, contacts
+from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation
 from bayessim_mjx.diagnosis.fitting.robot import Robot
+from bayessim_mjx.diagnosis.fitting.scales import mass_matrix
+from bayessim_mjx.diagnosis.fitting.simulable import contacts
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics import controllers
+from bayessim_mjx.physics.timestep import STAGES
 
 Array = NDArray[np.float64]
 # (robot's physics, first=coarsest stable factor, cheaper=see `Errors`) -> (the windows, the error of the time step)
 Measured = Callable[..., tuple[Any, Discretisation]]
-STAGES = 4  # of Runge and Kutta's method, each as dear as a step
 TOO_LONG = "the model's time step shows beside the noise, and in the time given nothing finer can be searched with"
 EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST"))
 
@@ -126,7 +128,7 @@ def choose(
     dt: float,
     logs: Sequence[Log],
     measured: Measured,
-    affordable: Callable[[float], bool] = lambda seconds: True,
+    left: float = np.inf,
 ) -> Choice:
     """The coarsest stable step; where what no sub-steps remove shows, and nothing can touch, RK4.
 
@@ -134,7 +136,7 @@ def choose(
     fraction of a millisecond, usually) is found as an effect.
 
     Args:
-        affordable: whether there is time for simulations of all windows that take so many seconds each.
+        left: s that one simulation of all windows may take, for the search to end in time.
     """
     stable = coarsest_stable(robot.physics(dt).mj_model, logs)
     robot = stable.robot(robot)
@@ -144,7 +146,7 @@ def choose(
         return plain
     if contacts(own) or int(own.mj_model.opt.integrator) == RK4:
         return plain
-    if not affordable(STAGES * plain.worth.errors.seconds if plain.worth.errors else 0.0):
+    if plain.worth.errors and (len(STAGES) + 1) * plain.worth.errors.seconds >= left:
         return dataclasses.replace(plain, better=(TOO_LONG,))
     other = _integrated(robot, RK4)
     physics = other.physics(dt)
@@ -250,9 +252,7 @@ def _at(model: mujoco.MjModel, qpos: Array, qvel: Array, command: Array, law: co
     position, velocity = columns(0, True, 0), columns(1, True, 0)
     forces = columns(1, False, 1)
     forward(np.zeros(nv), np.zeros(nv))
-    inertia = np.zeros((nv, nv))
-    for v in range(nv):
-        mujoco.mj_mulM(model, data, inertia[v], np.eye(nv)[v])
+    inertia = mass_matrix(model, data)
     damped = not int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
     of_euler = -np.diag(model.dof_damping) if damped else np.zeros((nv, nv))
     implicit = {EULER: np.linalg.solve(inertia, of_euler), IMPLICITFAST: np.linalg.solve(inertia, forces)}

@@ -8,6 +8,7 @@ model lacks.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,11 +17,16 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.fitting.reference_stepper import Stepper
+from bayessim_mjx.diagnosis.fitting.scales import mass_matrix
+from bayessim_mjx.diagnosis.logcheck.drives import DeclaredLaw
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
+from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
+# rad or m, rad/s or m/s, of the finite differences: as usual with MuJoCo's own (mjd_transitionFD). Rounding of doubles
+# costs about 1e-10 then; what is lost where a contact begins was not measured.
+NUDGE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,7 @@ class Rules:
         angle: rad or m, standard deviation of a position at a log's first row; speed: rad/s or m/s, of a velocity.
         shares: of typical accelerations, that the model may lack; the most likely one of each log is taken.
         passes: smoothed start states are filtered from again.
-        second: s, in which a start state has to show; told: of its standard deviation that may be left after that.
+        second: s, in which a start state has to show; known: of its standard deviation that may be left after that.
         most: share of the logs, from which on all of them is filtered.
         least: rad, rad/s, as precise as the model is taken to be.
     """
@@ -134,10 +140,7 @@ def _accelerations(model: mujoco.MjModel, log: Log) -> Array:
         data.ctrl[:] = np.percentile(np.abs(log.ctrl), 95, axis=0) if model.nu else 0.0
         mujoco.mj_forward(model, data)
         forces.append(np.abs(data.qfrc_bias) + np.abs(data.qfrc_actuator))
-        for v in range(model.nv):
-            column = np.zeros(model.nv)
-            mujoco.mj_mulM(model, data, column, np.eye(model.nv)[v])
-            inertia[v] += column[v] / 20
+        inertia += np.diag(mass_matrix(model, data)) / 20
     return np.maximum(np.mean(forces, axis=0) / np.maximum(inertia, 1e-12), 1e-3)
 
 
@@ -272,3 +275,62 @@ def _demand(ways: Sequence[tuple[Log, Way]], model: mujoco.MjModel) -> None:
             f"{log.name}: what was measured ({', '.join(given)}) does not tell the motion of {', '.join(names)}; "
             "allowed: logs that measure these joints, or joints that they move"
         )
+
+
+class Stepper:
+    """Steps of a log: its commands through its controller, at the model's own step or a little less.
+
+    States are (qpos `[nq]`, qvel `[nv]`); changes of them `[2 nv]` are in the tangent space.
+    """
+
+    def __init__(self, model: mujoco.MjModel, log: Log) -> None:
+        self.model, self.log, self.nv = copy.copy(model), log, int(model.nv)
+        self.data, self.longest = mujoco.MjData(self.model), float(model.opt.timestep)
+        declared = controllers.declared(log.metadata)
+        source = str(log.metadata.get("source", log.name))
+        law = controllers.read(log.metadata, model, log.actuators, source) if declared else None
+        self.loop = None if law is None else DeclaredLaw(law)
+
+    def reset(self) -> None:
+        """Actuators without a past."""
+        mujoco.mj_resetData(self.model, self.data)
+
+    def advanced(self, qpos: Array, qvel: Array, row: int) -> tuple[Array, Array]:
+        """The state at the next row."""
+        data, span = self.data, float(self.log.time[row + 1] - self.log.time[row])
+        steps = max(1, int(np.ceil(span / self.longest - 1e-6)))
+        self.model.opt.timestep = span / steps
+        command = self.log.ctrl[row]
+        if self.log.linear:
+            command = 0.5 * (command + self.log.ctrl[row + 1])
+        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos, qvel, 0.0
+        data.ctrl[:] = command
+        for _ in range(steps):
+            if self.loop is not None:
+                data.ctrl[:] = self.loop(command, data.qpos, data.qvel)
+            mujoco.mj_step(self.model, data)
+        return data.qpos.copy(), data.qvel.copy()
+
+    def linearised(self, qpos: Array, qvel: Array, row: int) -> tuple[Array, Array, Array]:
+        """(qpos, qvel) at the next row, and their derivatives by the state `[2 nv, 2 nv]`."""
+        before = self.data.act.copy()
+        ends = self.advanced(qpos, qvel, row)
+        after = self.data.act.copy()
+        way = np.empty((2 * self.nv, 2 * self.nv))
+        for i, nudge in enumerate(NUDGE * np.eye(2 * self.nv)):
+            self.data.act[:] = before
+            way[:, i] = self.difference(*ends, *self.advanced(*self.moved(qpos, qvel, nudge), row)) / NUDGE
+        self.data.act[:] = after
+        return *ends, way
+
+    def moved(self, qpos: Array, qvel: Array, change: Array) -> tuple[Array, Array]:
+        there = np.array(qpos)
+        mujoco.mj_integratePos(self.model, there, change[: self.nv], 1.0)
+        return there, qvel + change[self.nv :]
+
+    def difference(self, qpos: Array, qvel: Array, to_qpos: Array, to_qvel: Array) -> Array:
+        """The change `[2 nv]` from one state to another."""
+        out = np.empty(2 * self.nv)
+        mujoco.mj_differentiatePos(self.model, out[: self.nv], 1.0, qpos, to_qpos)
+        out[self.nv :] = to_qvel - qvel
+        return out

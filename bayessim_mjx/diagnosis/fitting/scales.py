@@ -95,7 +95,7 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
             data.qpos[:], data.qvel[:], data.qacc[:] = log.qpos[k], log.qvel[k], acceleration[k]
             mujoco.mj_inverse(model, data)
             torque.append(np.abs(data.qfrc_inverse))
-            inertia.append(_diagonal(model, data))
+            inertia.append(np.diag(mass_matrix(model, data)))
     command = _large([log.ctrl for log in logs])
     force = np.percentile(torque, LIMITS.large, axis=0)
     effort = np.zeros(model.nu)
@@ -145,12 +145,11 @@ def _span(model: mujoco.MjModel, log: Log) -> Array:
     return np.ptp(away, axis=0) if len(log) else np.zeros(model.nv)
 
 
-def _diagonal(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
-    """Diagonal of the mass matrix `[nv]`, by its product with each unit vector (the same call in every MuJoCo)."""
-    column, out = np.zeros(model.nv), np.zeros(model.nv)
-    for v in range(model.nv):
-        mujoco.mj_mulM(model, data, column, np.eye(model.nv)[v])
-        out[v] = column[v]
+def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """`[nv, nv]`, by its product with each unit vector (the same call in every MuJoCo)."""
+    out = np.zeros((model.nv, model.nv))
+    for column, unit in zip(out, np.eye(model.nv), strict=True):
+        mujoco.mj_mulM(model, data, column, unit)
     return out
 
 

@@ -1,15 +1,21 @@
-"""Whether MJX can simulate a model that somebody brings, and what to change where it cannot."""
+"""Whether MJX can simulate a model that somebody brings, what to change where it cannot, and what may be left out."""
 
 import math
 import warnings
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.physics import mjx
+from bayessim_mjx.logs.log import Log
+from bayessim_mjx.physics import Physics, mjx
 
 AXIAL = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+# Of a joint's travel in the logs and of its range, the larger: as near as the motion has to come
+# (docs/decisions/unreached_limits.md).
+NEAR_TRAVEL, NEAR_RANGE = 0.25, 0.05
 
 
 def one_line(error: Exception) -> str:
@@ -80,3 +86,22 @@ _REMEDIES = {
 
 def label(model: mujoco.MjModel, kind: str, i: int) -> str:
     return getattr(model, kind)(i).name or f"{kind}{i}"
+
+
+def contacts(physics: Physics) -> bool:
+    """Whether anything can touch."""
+    return bool(physics.template._impl.contact.dist.shape[0])
+
+
+def unreached(model: mujoco.MjModel, logs: Sequence[Log]) -> tuple[int, ...]:
+    """Joints with limits whose motion in the logs stays away from them; none that is not measured in all logs."""
+    return tuple(j for j in range(model.njnt) if model.jnt_limited[j] and _away(model, j, logs))
+
+
+def _away(model: mujoco.MjModel, j: int, logs: Sequence[Log]) -> bool:
+    if model.jnt_type[j] not in AXIAL or not all(log.seen_dofs[model.jnt_dofadr[j]] for log in logs):
+        return False
+    q = np.concatenate([log.qpos[:, model.jnt_qposadr[j]] for log in logs])
+    low, high = model.jnt_range[j]
+    room = max(NEAR_TRAVEL * np.ptp(q), NEAR_RANGE * (high - low))
+    return bool(low + room < q.min() and q.max() < high - room)

@@ -24,7 +24,7 @@ from bayessim_mjx.physics.tangent import difference, integrate
 
 Array = NDArray[np.float64]
 
-FAR = 1e3  # rad or m, rad/s or m/s: the error of a simulation that diverged
+FAR = 1e3  # rad or m, rad/s or m/s: the error of a simulation that diverged, above all motion; a rule of thumb
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,10 @@ def physics_of(robot: Robot, dt: float, effects: Sequence[Effect]) -> Physics:
 class Call:
     """Worlds in one call."""
 
-    # worlds in one call; fewer are padded, more are cut. A CPU wants them in its cache (a pendulum's: 2.2 times as
-    # fast as 1024) and one call on each core, an accelerator as many as it can get
+    # fewer are padded, more are cut. A CPU wants them in its cache and one call on each core. Measured with a pendulum:
+    # 2.2 times as fast as 1024
     cpu_lanes: int = 64
-    lanes: int = 4096
+    lanes: int = 4096  # an accelerator wants as many as it can get; not counted
 
 
 CALL = Call()
@@ -87,11 +87,13 @@ class Simulator:
         self.lanes = lanes or (CALL.cpu_lanes if on_cpu else CALL.lanes)
         self.apart = on_cpu
         self.nv = int(physics.mj_model.nv)
-        self.channels = 2 * self.nv
         self.rollouts = 0
         self._run = programs.Kept(self._many, programs.traced_from(physics, "windows"))
         self._no_offset = np.zeros((self.lanes, 2 * self.nv), np.float32)
         self._no_force = jnp.asarray(np.zeros((self.lanes, windows.steps, self.nv), np.float32))
+        nominal = jnp.asarray(np.asarray(physics.space.nominal, np.float32))
+        size = jax.eval_shape(lambda theta: _packed(physics.unseen(theta, None, None, {})), nominal).size
+        self._measured: tuple[Any, Any] = jnp.asarray(np.zeros((self.lanes, size), np.int32)), np.array(True)
 
     @property
     def programs(self) -> int:
@@ -105,14 +107,19 @@ class Simulator:
         thetas: jax.Array,
         offsets: jax.Array,
         forces: jax.Array,
+        before: jax.Array,
+        anew: jax.Array,
         active: jax.Array | None,
     ) -> tuple[jax.Array, jax.Array]:
-        """Errors `[n, H, 2 nv]` of windows (positions, velocities) and the actuators' forces `[n, H, nu]`.
+        """Errors `[n, H, 2 nv]` of windows (positions, velocities), and the worlds at their ends as `_packed` has them.
 
         Worlds are side by side inside the loop: `vmap` of a loop would trace its body several times over.
+
+        Args:
+            anew: `[]`, whether windows begin with the recorded motion; False: with the worlds `before` `[n, D]`.
         """
-        begun = functools.partial(self._begun, batch, active)
-        own, past, first = jax.vmap(begun, out_axes=(0, 0, None))(index, thetas, offsets)
+        begun = functools.partial(self._begun, batch, active, anew)
+        own, past, first = jax.vmap(begun, out_axes=(0, 0, None))(index, thetas, offsets, before)
         model, lead, (n, count, *_) = self.physics.mj_model, past.steps, own.command.shape
         command = jnp.concatenate([own.around.command[:, :lead], own.command], axis=1)
 
@@ -125,22 +132,32 @@ class Simulator:
                 drive = Drive(extra, None if own.enabled is None else own.enabled[row], own.law, active)
                 now, data = control_step(self.physics, past.led(k, now), command[k], drive)
                 velocity = now.measurement["qvel"] + early(model) * data.qacc
-                return now, (now.measurement["qpos"], velocity, data.actuator_force)
+                return now, (now.measurement["qpos"], velocity)
 
             now, new = jax.vmap(one)(past, own, command, forces, now)
             return now, tuple(x.at[:, row].set(y) for x, y in zip(shown, new, strict=True))
 
-        nothing = tuple(jnp.zeros((n, count, size)) for size in (model.nq, model.nv, model.nu))
-        _, (qpos, qvel, effort) = jax.lax.fori_loop(first, lead + count, step, (past.world, nothing))
-        return jax.vmap(self._errors)(own, qpos, qvel, past.start.theta), effort
+        nothing = tuple(jnp.zeros((n, count, size)) for size in (model.nq, model.nv))
+        ends, (qpos, qvel) = jax.lax.fori_loop(first, lead + count, step, (past.world, nothing))
+        errors = functools.partial(self._errors, anew)
+        return jax.vmap(errors)(own, qpos, qvel, past.start.theta), jax.vmap(_packed)(ends)
 
     def _begun(
-        self, batch: Batch, active: jax.Array | None, index: jax.Array, theta: jax.Array, offset: jax.Array
+        self,
+        batch: Batch,
+        active: jax.Array | None,
+        anew: jax.Array,
+        index: jax.Array,
+        theta: jax.Array,
+        offset: jax.Array,
+        before: jax.Array,
     ) -> tuple[Batch, Past, int | jax.Array]:
         """(one window, what leads up to its start, the control step to begin with)."""
         own = jax.tree.map(lambda x: x[index], batch)
         world = begin(self.physics, theta, self._moved(own.around, offset), active)
         past = past_of(self.physics, world, own.around, active)
+        start = jax.tree.map(functools.partial(jnp.where, anew), past.start, _unpacked(before, past.start))
+        past = past.replace(start=start, world=past.world if past.steps else start, wanted=past.wanted & anew)
         return own, past, past.first
 
     def _moved(self, motion: Motion, offset: jax.Array) -> Motion:
@@ -155,10 +172,11 @@ class Simulator:
         qpos = jax.vmap(functools.partial(integrate, self.physics.mj_model))(motion.qpos, away)
         return motion.replace(qpos=qpos, qvel=motion.qvel + speed)
 
-    def _errors(self, own: Batch, qpos: jax.Array, qvel: jax.Array, theta: jax.Array) -> jax.Array:
+    def _errors(self, anew: jax.Array, own: Batch, qpos: jax.Array, qvel: jax.Array, theta: jax.Array) -> jax.Array:
         """`[H, 2 nv]`, of one window; not finite ones are FAR."""
         error = jax.vmap(functools.partial(difference, self.physics.mj_model))(own.qpos, qpos)
-        errors = self._predicted(jnp.concatenate([error, own.qvel - qvel], axis=1), theta)
+        error = jnp.concatenate([error, own.qvel - qvel], axis=1)
+        errors = jnp.where(anew, self._predicted(error, theta), error)
         return jnp.nan_to_num(errors, nan=FAR, posinf=FAR, neginf=-FAR)
 
     def _predicted(self, errors: jax.Array, theta: jax.Array) -> jax.Array:
@@ -207,23 +225,75 @@ class Simulator:
         force: NDArray[np.float32] | None = None,
     ) -> Array:
         """`run` of worlds one by one: `[m, H, 2 nv]` for indices `[m]` of thetas and windows, offsets `[m, 2 nv]`."""
-        count = len(of_theta)
-        moved = None if offsets is None else np.asarray(offsets, np.float32)
-        acting, thetas = self.physics.acting(thetas), np.asarray(thetas, np.float32)
+        return self._through([(self.windows.batch, np.asarray(of_window))], thetas, of_theta, offsets, force)
 
-        def given(first: int) -> tuple:
+    def run_on(self, thetas: Array, offsets: Array, chains: Windows, chain: NDArray[np.int64]) -> Array:
+        """Worlds simulated from window to window, each beginning where the one before it ends, by the same program.
+
+        Args:
+            thetas: `[m, P]`; offsets: `[m, 2 nv]`, changes of the measured states at the first windows' starts.
+            chains: windows as long as one's own, at most as many at a time; chain: `[m, K]`, each world's in order.
+
+        Returns:
+            Measured minus simulated motion `[m, K H, 2 nv]`, as of `run`.
+        """
+        return self._through([self._part(chains, own) for own in chain.T], thetas, np.arange(len(thetas)), offsets)
+
+    def _through(
+        self,
+        parts: Sequence[tuple[Batch, NDArray[np.int64]]],
+        thetas: Array,
+        of_theta: NDArray[np.int64],
+        offsets: Array | None,
+        force: NDArray[np.float32] | None = None,
+    ) -> Array:
+        """Errors `[m, K H, 2 nv]` of worlds that go through K windows: of each a batch, and indices `[m]` in it."""
+        acting, thetas, count = self.physics.acting(thetas), np.asarray(thetas, np.float32), len(of_theta)
+        moved = None if offsets is None else np.asarray(offsets, np.float32)
+
+        def one(first: int) -> NDArray[np.float32]:
             own = first + np.minimum(np.arange(self.lanes), min(self.lanes, count - first) - 1)
             offset = self._no_offset if moved is None else moved[own]
             extra = self._no_force if force is None else force[own]
             active = acting[of_theta[own]].any(0) if self.apart else None
-            return self.windows.batch, of_window[own], thetas[of_theta[own]], offset, extra, active
+            found: list[NDArray[np.float32]] = []
+            before, anew = self._measured
+            for batch, index in parts:
+                given = index[own], thetas[of_theta[own]], offset, extra, before, anew, active
+                errors, before = self._run(batch, *given)
+                found.append(np.asarray(errors)[: count - first])
+                before = np.asarray(before)  # as JAX gives it, it stays on its device: for JAX another program
+                offset, anew = self._no_offset, np.array(False)
+            return np.concatenate(found, axis=1)
 
-        def part(first: int) -> NDArray[np.float32]:
-            return np.asarray(self._run(*given(first))[0])[: count - first]
-
-        firsts = list(range(0, count, self.lanes))
-        if self.apart and not self.rollouts:
-            self._run.ready(*given(0))  # once, not by every thread
-        done = on_cores(part, firsts) if self.apart else [part(first) for first in firsts]
-        self.rollouts += count
+        firsts = range(0, count, self.lanes)
+        alone = len(firsts) if not self.apart else 0 if self.rollouts else 1  # one thread compiles
+        done = [*map(one, firsts[:alone]), *on_cores(one, firsts[alone:])]
+        self.rollouts += count * len(parts)
         return np.concatenate(done).astype(np.float64)
+
+    def _part(self, chains: Windows, which: NDArray[np.int64]) -> tuple[Batch, NDArray[np.int64]]:
+        """Some windows in a batch of the shape of one's own, and where in it each of `which` stands."""
+        unique, index = np.unique(which, return_inverse=True)
+        rows = np.resize(unique, len(self.windows))
+        return jax.tree.map(lambda x: np.asarray(x)[rows], chains.batch), index
+
+
+def _packed(world: World) -> jax.Array:
+    """The bits of a world's state and of what its effects remember, `[D]`: a call takes time for each array."""
+    leaves = jax.tree.leaves(world.replace(theta=(), fields={}))
+    return jnp.concatenate([_cast(jnp.asarray(x), jnp.dtype("int32")).ravel() for x in leaves])
+
+
+def _unpacked(packed: jax.Array, like: World) -> World:
+    """The world that `_packed` was made of, with the theta and the model of another."""
+    leaves, tree = jax.tree.flatten(like.replace(theta=(), fields={}))
+    parts = jnp.split(packed, np.cumsum([x.size for x in leaves])[:-1])
+    each = [_cast(part.reshape(x.shape), x.dtype) for part, x in zip(parts, leaves, strict=True)]
+    return jax.tree.unflatten(tree, each).replace(theta=like.theta, fields=like.fields)
+
+
+def _cast(x: jax.Array, to: Any) -> jax.Array:
+    """The same bits, where both have 32."""
+    same = x.dtype.itemsize == to.itemsize
+    return jax.lax.bitcast_convert_type(x, to) if same else x.astype(to)

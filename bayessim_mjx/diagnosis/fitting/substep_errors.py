@@ -64,13 +64,13 @@ class Errors:
     """Windows without effects at any sub-step, by one compiled program: measured minus simulated, `[W, H, 2 nv]`.
 
     Args:
-        cut: the windows, with commands for the coarsest sub-steps that are asked for; most: the finest factor.
+        cut: the windows, with commands for the coarsest sub-steps that are asked for; finest: the largest factor.
         cheaper: the same windows by an integrator that costs less, with their start states fitted: derivatives are
             taken there, and start states begin there.
     """
 
-    def __init__(self, physics: Physics, cut: Windows, most: int, cheaper: Errors | None = None) -> None:
-        self.physics, self.cut, self.most, self.cheaper = physics, cut, most * physics.substeps, cheaper
+    def __init__(self, physics: Physics, cut: Windows, finest: int, cheaper: Errors | None = None) -> None:
+        self.physics, self.cut, self.finest, self.cheaper = physics, cut, finest, cheaper
         self.first = cut.batch.command.shape[2] // physics.substeps
         self.theta = np.asarray(physics.space.nominal, np.float32)
         nothing = np.zeros((len(cut), 2 * physics.mj_model.nv))
@@ -79,7 +79,8 @@ class Errors:
         self._moved: tuple[Array, Array] | None = None  # start states, and the derivatives there
         self._no_force = np.zeros((len(cut), cut.steps, physics.mj_model.nv), np.float32)
         axes = (0, 0, 0, None, None, None, None)
-        self._run = programs.Kept(jax.vmap(self._one, in_axes=axes), programs.traced_from(physics, "sub-steps"))
+        precise = jax.default_matmul_precision("highest")(self._errors)
+        self._run = programs.Kept(jax.vmap(precise, in_axes=axes), programs.traced_from(physics, "sub-steps"))
 
     def run(self, cut: Windows, factor: int, corrected: bool = True, offsets: Array | None = None) -> Array:
         """With the commands of `cut` at the sub-step h / factor; corrected: velocities lie half of that early."""
@@ -91,7 +92,7 @@ class Errors:
 
         def one(case: Case) -> Array:
             count = case.cut.batch.command.shape[2]
-            missing = [(0, 0), (0, 0), (0, self.most - count), (0, 0)]
+            missing = [(0, 0), (0, 0), (0, self.finest * self.physics.substeps - count), (0, 0)]
             command = np.pad(np.asarray(case.cut.batch.command), missing)  # the past keeps its shape
             batch = self.cut.batch.replace(command=command)
             offsets = self.offsets if case.offsets is None else self.offsets + case.offsets
@@ -104,10 +105,6 @@ class Errors:
         found = np.stack(on_cores(one, cases))
         self.seconds = (time.monotonic() - began) / len(cases)
         return np.nan_to_num(found, nan=1e3, posinf=1e3, neginf=-1e3)
-
-    def _one(self, own: Batch, *given: jax.Array) -> jax.Array:
-        with jax.default_matmul_precision("highest"):
-            return self._errors(own, *given)
 
     def _errors(
         self,
@@ -156,7 +153,7 @@ class Errors:
     def differences(self, factor: int) -> Errors:
         """Where differences at the sub-step h / factor are taken: they need no better integrator than this one."""
         other = self.cheaper
-        return self if other is None or not other.first <= factor <= other.most // other.physics.substeps else other
+        return self if other is None or not other.first <= factor <= other.finest else other
 
     def start(self, sigma: Array) -> None:
         """Fit the start states: far from the measured motion the time step is worth something else."""

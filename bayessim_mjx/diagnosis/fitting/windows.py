@@ -107,7 +107,6 @@ def cut(
     limit: int,
     group: str | None = None,
     use_qvel: bool = True,
-    first_only: bool = False,
     starts: list[tuple[int, int]] | None = None,
     centred: bool = True,
 ) -> Windows:
@@ -115,7 +114,6 @@ def cut(
 
     Args:
         use_qvel: compare measured velocities too (where all logs have them).
-        first_only: one window per log, at its beginning (whole episodes).
         starts: (log, row) of the windows wanted; beyond the end of a log its last row is held.
         centred: commands are centred on the force evaluations, where the integrator is `staggered`; False: the physics
             does that (`centred.physics_of`).
@@ -126,7 +124,7 @@ def cut(
     even, centred = [resample(log, dt) for log in logs], centred and staggered(model)
     fine = [_fine_commands(log, e, dt, substeps, centred) for log, e in zip(logs, even, strict=True)]
     group_of, names = groups_of(logs, group)
-    starts = _starts(even, length, limit, None if first_only else _past(dt)) if starts is None else starts
+    starts = _starts(even, length, limit, _past(dt)) if starts is None else starts
     if not starts:
         longest = max(len(e) - 1 for e in even)
         raise UserError(
@@ -179,17 +177,17 @@ def _past(dt: float) -> int:
     return max(2, int(np.ceil(AROUND / dt)))
 
 
-def _starts(logs: Sequence[Log], length: int, limit: int, past: int | None) -> list[tuple[int, int]]:
-    """(log, row); None: one per log, at its beginning.
+def _starts(logs: Sequence[Log], length: int, limit: int, past: int) -> list[tuple[int, int]]:
+    """(log, row) of windows one after the other, spread evenly where they are too many.
 
-    Of others the first has up to `past` rows before it, as far as that costs no window: which commands acted before a
-    log began is not known, and what remembers them would be judged by a guess.
+    The first has up to `past` rows before it, as far as that costs no window: which commands acted before a log began
+    is not known, and what remembers them would be judged by a guess.
     """
     every = []
     for r, log in enumerate(logs):
         last = len(log) - 1 - length
         if last >= 0:
-            every += [(r, 0)] if past is None else [(r, a) for a in range(min(past, last % length), last + 1, length)]
+            every += [(r, a) for a in range(min(past, last % length), last + 1, length)]
     if len(every) <= limit:
         return every
     keep = np.unique(np.linspace(0, len(every) - 1, limit).round().astype(int))

@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting import windows
-from bayessim_mjx.diagnosis.fitting.discretisation import contacts, refined
+from bayessim_mjx.diagnosis.fitting.discretisation import refined
+from bayessim_mjx.diagnosis.fitting.simulable import contacts
 from bayessim_mjx.diagnosis.fitting.simulator import FAR, Simulator, physics_of
 from bayessim_mjx.diagnosis.selection.budget import Progress
-from bayessim_mjx.diagnosis.summary.whole_logs import theta_of
 from bayessim_mjx.physics import staggered
 
 Array = NDArray[np.float64]
-FINER = 4  # times as many steps as the fit took: a quarter of an error of first order is left, and extrapolated
-TOLD = 2.0  # standard deviations without it, from where on a parameter's shift is told
+# times as many steps as the fit took: a quarter of an error of first order is left, and extrapolated (Richardson 1911)
+FINER = 4
+FAR_OFF = 2.0  # standard deviations, beyond which a sentence gives a parameter's shift: a rule of thumb
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class AtFinerSteps:
         parts = [
             f"{c.name} {value + shift:.3g} in place of {value:.3g} {c.unit}".rstrip()
             for c, value, shift, sd in each
-            if c.name in own and abs(shift) > TOLD * sd
+            if c.name in own and abs(shift) > FAR_OFF * sd
         ]
         text = "the time step is in the parameters: at ever finer steps they would be"
         return [f"{text} {', '.join(parts)} (counted in their intervals)"] if parts else []
@@ -64,7 +65,8 @@ def _shift(found: Findings) -> Array | None:
     """Of the coordinates; None where finer steps cannot be simulated."""
     fit, fitter = found.model.fit, found.setup.fitter
     simulator = _simulator(found)
-    theta = theta_of(found, simulator, found.model, fit.values)
+    space, small = found.setup.physics.space, simulator.physics.space
+    theta = fitter.vector(fit.coordinates, fit.values)[[space.index(name) for name in small.names]]
     errors = simulator.run(theta[None], fit.offsets[None])
     if np.abs(errors).max() >= FAR:
         return None

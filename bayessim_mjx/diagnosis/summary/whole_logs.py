@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.device import cores
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting import windows
-from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
+from bayessim_mjx.diagnosis.fitting.simulator import FAR
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import KNOWN, Model, of_noise, systematic
@@ -25,19 +23,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How much of whole logs is simulated, and what is told of it."""
+    """How much of whole logs is simulated, and when their errors are compared. Rules of thumb, not counted."""
 
     # at most
     logs: int = 8
     seconds: float = 10.0
     draws: int = 4  # of the start state
     likely: int = 8  # of start state and parameters together
-    lanes: int = 128  # worlds in one call
     # noise sd and share of the motion: what a start's uncertainty may grow to
     clear: float = 3.0
     part: float = 0.1
     least: int = 2  # windows that a log must be predictable for
-    lost: float = 999.0  # the simulator's mark of what is not finite
 
 
 RULES = Rules()
@@ -105,13 +101,11 @@ def simulate(found: Findings) -> Whole:
     starts = [int(cut.start[w]) for w in first]
     most = round(RULES.seconds / cut.dt)
     length = [min(len(cut.logs[r]) - 1 - a, most) for r, a in zip(logs, starts, strict=True)]
-    worlds = len(first) * (len(stages) + RULES.draws + RULES.likely)
-    lanes = min(-(-worlds // (cores() if jax.default_backend() == "cpu" else 1)), RULES.lanes)
-    simulator = _simulator(found, logs, starts, max(length), lanes)
+    chains = _chains(setup, logs, starts, max(length))
     errors, spread, likely = [], [], []
     root = _root(found, list(stages.values())[-1].model)
     every = len(stages) + RULES.draws
-    for whole, steps in zip(_simulated(found, simulator, stages, root, first), length, strict=True):
+    for whole, steps in zip(_simulated(found, chains, stages, root, first), length, strict=True):
         rows = whole[:, :steps]
         errors.append(rows[: len(stages)])
         spread.append(rows[len(stages) : every] - rows[len(stages) - 1])
@@ -121,39 +115,31 @@ def simulate(found: Findings) -> Whole:
     return _judged(setup, list(stages), names, cut.condition[first], errors, spread, likely, seen)
 
 
-def _simulator(found: Findings, logs: Array, starts: list[int], length: int, lanes: int) -> Simulator:
-    """Of the named effects only: a small program, compiled in seconds."""
-    setup, named = found.setup, {e.effect for e in found.model.effects}
-    cut = setup.fitter.simulator.windows
-    physics = physics_of(setup.robot, cut.dt, [e for e in setup.physics.effects if e.name in named])
-    some = [setup.logs[r] for r in logs]
-    where = list(enumerate(starts))
-    own = windows.cut(
-        some, physics.mj_model, cut.dt, physics.substeps, length, limit=len(some), starts=where, centred=False
+def _chains(setup: Setup, logs: Array, starts: Sequence[int], length: int) -> windows.Windows:
+    """Windows that follow each other over each log, as many for each; beyond a log's end its last row is held."""
+    cut, physics = setup.fitter.simulator.windows, setup.physics
+    ahead = range(0, length, cut.steps)
+    each = [(int(r), min(a + k, len(cut.logs[r]) - 1)) for r, a in zip(logs, starts, strict=True) for k in ahead]
+    return windows.cut(
+        setup.logs, physics.mj_model, cut.dt, physics.substeps, cut.steps, limit=len(each), starts=each, centred=False
     )
-    return Simulator(physics, own, lanes)
 
 
 def _simulated(
-    found: Findings, simulator: Simulator, stages: dict[str, _Stage], away: Array, first: Sequence[int]
+    found: Findings, chains: windows.Windows, stages: dict[str, _Stage], away: Array, first: Sequence[int]
 ) -> Array:
-    """Whitened errors `[L, stages + draws + likely, H, channels]`, of all logs; `away`: `_root` of the last.
-
-    A step of few worlds takes as long as one of many: most of it is spent on starting the program's parts.
-    """
+    """Whitened errors `[L, stages + draws + likely, H, channels]`, of all logs; `away`: `_root` of the last."""
     fitter = found.setup.fitter
-    drawn = [_drawn(found, simulator, stages, away, w) for w in first]
+    drawn = [_drawn(found, stages, away, w) for w in first]
     thetas, offsets = (np.concatenate(each) for each in zip(*drawn, strict=True))
-    each = len(thetas) // len(first)
-    raw = simulator.run_each(thetas, np.arange(len(thetas)), np.repeat(np.arange(len(first)), each), offsets)
-    raw[np.abs(raw) >= RULES.lost] = np.nan
-    raw = raw.reshape(len(first), each, *raw.shape[1:])
+    chain = np.repeat(np.arange(len(chains)).reshape(len(first), -1), len(thetas) // len(first), axis=0)
+    raw = fitter.simulator.run_on(thetas, offsets, chains, chain)
+    raw[np.abs(raw) >= FAR] = np.nan
+    raw = raw.reshape(len(first), -1, *raw.shape[1:])
     return np.asarray(raw[..., fitter.used] / fitter.sigma)
 
 
-def _drawn(
-    found: Findings, simulator: Simulator, stages: dict[str, _Stage], away: Array, w: int
-) -> tuple[Array, Array]:
+def _drawn(found: Findings, stages: dict[str, _Stage], away: Array, w: int) -> tuple[Array, Array]:
     """Thetas `[stages + draws + likely, P]` and changes of the start state `[.., 2 nv]` of the log of window w."""
     fitter, last = found.setup.fitter, list(stages.values())[-1]
     # a key of each log's own: with common draws of the parameters one direction would rule all logs alike
@@ -167,7 +153,8 @@ def _drawn(
     ends = np.array([(c.low, c.high) for c in last.model.fit.coordinates]).reshape(-1, 2).T
     drawn = [*[values[-1]] * RULES.draws, *np.clip(off, *ends)]
     models = [s.model for s in stages.values()] + [last.model] * len(drawn)
-    thetas = np.stack([theta_of(found, simulator, m, v) for m, v in zip(models, [*values, *drawn], strict=True)])
+    each = zip(models, [*values, *drawn], strict=True)
+    thetas = np.stack([fitter.vector(m.fit.coordinates, v) for m, v in each])
     return thetas, np.concatenate([offsets, moved])
 
 
@@ -191,12 +178,6 @@ def _own_fold(cut: windows.Windows, w: int) -> int | None:
     """Which fold holds all of window w's log out; None where none does, and the log is simulated in sample."""
     own = np.unique(cut.group[cut.log == cut.log[w]])
     return None if cut.blocks or len(own) > 1 else int(np.searchsorted(np.unique(cut.group), own[0]))
-
-
-def theta_of(found: Findings, simulator: Simulator, model: Model, values: Array) -> Array:
-    """theta of the small simulator."""
-    space, small = found.setup.physics.space, simulator.physics.space
-    return found.setup.fitter.vector(model.fit.coordinates, values)[[space.index(name) for name in small.names]]
 
 
 def _judged(

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check
-from bayessim_mjx.diagnosis.equation_error.proposals import lead, proposed
+from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check, lead, proposed
 from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import enumerate_candidates
 from bayessim_mjx.diagnosis.summary import first_look

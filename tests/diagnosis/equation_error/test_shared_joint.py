@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check
-from bayessim_mjx.diagnosis.equation_error.proposals import proposed
+from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check, proposed
 from tests.diagnosis.recordings import record
 
 PAIR = """<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody><body>

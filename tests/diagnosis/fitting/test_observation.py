@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.equation_error import proposals
+from bayessim_mjx.diagnosis.equation_error import inverse_dynamics_check
 from bayessim_mjx.diagnosis.fitting import observation
 from bayessim_mjx.diagnosis.fitting.robot import robot_of
 from bayessim_mjx.diagnosis.logcheck import gate, links
@@ -70,7 +70,7 @@ def test_a_joint_with_a_velocity_alone(arm):
 def test_checks_that_need_the_motion_of_all_joints_are_said_to_be_left_out(arm):
     log, told = without(recorded(), "qpos:elbow"), []
     for _ in range(2):
-        assert not proposals.looked([log], robot_of(arm), told).proposals
+        assert not inverse_dynamics_check.looked([log], robot_of(arm), told).proposals
     assert len(told) == 1 and "left out: they need the motion of all joints, and qpos:elbow was not" in told[0]
 
 
@@ -82,7 +82,7 @@ def test_checks_go_on_without_the_velocity_of_a_joint_whose_position_was_measure
         write_log(tmp_path / name / "run.csv", dataclasses.replace(log, absent=absent))
     (whole,), (part,) = (read_logs(tmp_path / name, arm, partial=True) for name in ("whole", "part"))
     assert part.absent == ("qvel:elbow",) and observation.completed([part], arm)[0] is part
-    looks = [proposals.looked([one], robot_of(arm), told) for one in (whole, part)]
+    looks = [inverse_dynamics_check.looked([one], robot_of(arm), told) for one in (whole, part)]
     assert not told and [j.name for j in looks[1].joints] == ["shoulder", "elbow"]
     for before, after in zip(looks[0].joints, looks[1].joints, strict=True):
         assert after.needs == pytest.approx(before.needs, rel=0.01) == pytest.approx(1.0, abs=0.1)

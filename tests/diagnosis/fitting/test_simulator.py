@@ -6,7 +6,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from jax import monitoring
 
+from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.setup import prepare
@@ -114,6 +116,31 @@ def test_a_force_is_the_torque_of_a_motor(simulator):
     batch = cut.batch.replace(command=cut.batch.command + 0.05, around=past)
     motor = Simulator(simulator.physics, dataclasses.replace(cut, batch=batch), lanes=32).run(theta[None])
     assert np.abs(pushed - motor).max() < 1e-5
+
+
+def test_windows_one_after_the_other_are_one_long_window(tmp_path):
+    """Each begins with the state, the drives' and the sensors' memory that the one before it ends with."""
+    remembering = ["actuator_delay", "backlash", "coulomb_friction", "sensor_delay"]
+    ready = prepare(nominal(tmp_path), recorded(count=2, seconds=2.0, sigma=1e-3), Request(remembering))
+    own, physics = ready.fitter.simulator, ready.physics
+    rng, first = np.random.default_rng(0), int(own.windows.start[0])
+    thetas = np.array([rng.uniform(p.low, p.high, 3) for p in physics.space.parameters]).T
+    offsets, of_log = 0.01 * rng.normal(size=(3, 2)), np.array([1, 0, 1])
+
+    def cut(starts, length):
+        given = own.windows.dt, physics.substeps, length
+        return windows.cut(ready.logs, physics.mj_model, *given, limit=9, starts=starts, centred=False)
+
+    steps = own.windows.steps
+    chains = cut([(log, first + k * steps) for log in (0, 1) for k in range(3)], steps)
+    own.run(thetas[:1])
+    compiled = []
+    monitoring.register_event_duration_secs_listener(lambda name, seconds, **about: compiled.append(name))
+    chained = own.run_on(thetas, offsets, chains, np.arange(6).reshape(2, 3)[of_log])
+    assert not [name for name in compiled if "compile" in name]
+    long = Simulator(physics, cut([(0, first), (1, first)], 3 * steps), lanes=3)
+    np.testing.assert_allclose(chained, long.run_each(thetas, np.arange(3), of_log, offsets), atol=1e-6)
+    assert np.abs(chained).max() > 0.1
 
 
 @pytest.mark.parametrize("size", [1e-3, 0.3])

@@ -29,14 +29,8 @@ def test_a_log_begins_as_its_first_window(rubbing):
         "with_effects": whole_logs._Stage(rubbing.model, rubbing.predictions["with_effects"], False),
     }
     first = int(np.flatnonzero(cut.log == 2)[0])
-    simulator = whole_logs._simulator(
-        rubbing,
-        np.array([2]),
-        [int(cut.start[first])],
-        3 * cut.steps,
-        2 + whole_logs.RULES.draws + whole_logs.RULES.likely,
-    )
-    (rows,) = whole_logs._simulated(rubbing, simulator, stages, whole_logs._root(rubbing, rubbing.model), [first])
+    chains = whole_logs._chains(rubbing.setup, np.array([2]), [int(cut.start[first])], 3 * cut.steps)
+    (rows,) = whole_logs._simulated(rubbing, chains, stages, whole_logs._root(rubbing, rubbing.model), [first])
     for row, stage in zip(rows, stages.values(), strict=False):
         np.testing.assert_allclose(row[: cut.steps], stage.prediction.error[first], atol=0.05)
 
@@ -63,7 +57,7 @@ def test_each_log_has_draws_of_its_own(rubbing):
     stages = {"with_effects": whole_logs._Stage(rubbing.model, rubbing.predictions["with_effects"], False)}
     away = []
     for w in (int(np.flatnonzero(cut.log == log)[0]) for log in range(3)):
-        thetas, _ = whole_logs._drawn(rubbing, rubbing.setup.fitter.simulator, stages, root, w)
+        thetas, _ = whole_logs._drawn(rubbing, stages, root, w)
         away.append(thetas[-whole_logs.RULES.likely :] - thetas[0])
     assert np.ptp(away[0], axis=0).max() > 0
     assert not np.allclose(away[0], away[1], rtol=0.01) and not np.allclose(away[1], away[2], rtol=0.01)

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.fitting import pruned_model
+from bayessim_mjx.diagnosis.fitting import robot, simulable
 from bayessim_mjx.diagnosis.fitting.robot import robot_of
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.setup import prepare
@@ -45,7 +45,7 @@ def log(model, *spans):
 )
 def test_limits_farther_than_a_quarter_of_the_travel_are_not_reached(a, b, away):
     model = mujoco.MjModel.from_xml_string(ARM)
-    assert pruned_model.unreached(model, [log(model, a, b, (0, 1)), log(model, (0, 0.1), (0, 0.1), (0, 1))]) == away
+    assert simulable.unreached(model, [log(model, a, b, (0, 1)), log(model, (0, 0.1), (0, 0.1), (0, 1))]) == away
 
 
 @pytest.mark.slow
@@ -70,8 +70,8 @@ RUBBING = ARM.replace("<joint name", '<joint frictionloss=".4" damping=".1" name
 def test_dry_friction_alone_needs_few_rounds_of_the_solver(touching):
     """The same motion as with all rounds; where something can touch they stay."""
     model = mujoco.MjModel.from_xml_string(RUBBING.replace('contype="0" conaffinity="0"', "") if touching else RUBBING)
-    few = pruned_model.pruned(robot_of(model), [log(model, (-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))], 0.01)
-    assert few.rounds == (None if touching else pruned_model.ROUNDS) and few.unlimited == (0, 1)
+    few = robot.pruned(robot_of(model), [log(model, (-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))], 0.01)
+    assert few.rounds == (None if touching else robot.ROUNDS) and few.unlimited == (0, 1)
     if not touching:
         ends = [swung(robot.physics(0.01)) for robot in (few, dataclasses.replace(few, rounds=None))]
         np.testing.assert_allclose(*ends, atol=2e-6)
