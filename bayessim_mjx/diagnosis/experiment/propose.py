@@ -12,12 +12,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.experiment.design import Scored, Scorer
 from bayessim_mjx.diagnosis.experiment.excitation import Excitation, Limits, limits_of, menu
 from bayessim_mjx.diagnosis.experiment.rehearsal import Drives, Played, Rehearsal
 from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.phrases import experiment as phrases
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model, nats
 from bayessim_mjx.diagnosis.selection.search_state import ranked

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import data_sheet, phrases
+from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.evidence.parameters import Posterior
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from bayessim_mjx.diagnosis.phrases import parameters as phrases
 from bayessim_mjx.diagnosis.selection.models import Model
 
 Array = NDArray[np.float64]
@@ -30,6 +31,7 @@ def parameters(selection: Selection, model: Model, sd: np.ndarray, mean: np.ndar
             **_against_data_sheet(c, real[i], float(model.fit.belief()[i])),
             "mean": real[i], "simulated": float(values[i]), "sd": float(sd[i]), "nominal": c.neutral,
             "low": c.low, "high": c.high, "unit": c.unit, "structural": remarks.get(c.name, ""),
+            "at_bound": _at_bound(c, float(values[i])),
             "same_as": list(selection.stand_ins.get(c.name, ())),
         }
         for i, c in enumerate(base)
@@ -69,9 +71,8 @@ def structural(fitter: Fitter, model: Model) -> dict[str, str]:
     base = len(fitter.base)
     groups = len(model.estimates)
     for i, c in enumerate(model.fit.coordinates[:base]):
-        value, width = model.fit.values[i], c.high - c.low
-        if min(value - c.low, c.high - value) < 1e-3 * width:
-            out[c.name] = phrases.stuck(value)
+        if _at_bound(c, model.fit.values[i]):
+            out[c.name] = phrases.stuck(model.fit.values[i])
     if groups < 3:
         return out
     each, deviation = per_condition(fitter, model)
@@ -83,6 +84,10 @@ def structural(fitter: Fitter, model: Model) -> dict[str, str]:
         if p < 1e-3 and spread > 0.05 * (c.high - c.low) and c.name not in out:
             out[c.name] = phrases.moves(spread, groups, fitter.simulator.windows.blocks)
     return out
+
+
+def _at_bound(c: Coordinate, value: float) -> bool:
+    return bool(min(value - c.low, c.high - value) < 1e-3 * (c.high - c.low))
 
 
 def per_condition(fitter: Fitter, model: Model) -> tuple[Array, Array]:

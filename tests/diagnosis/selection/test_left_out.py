@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis import phrases
+from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.selection import fits
 from bayessim_mjx.diagnosis.selection.budget import ENDS, Budget, begun
 from bayessim_mjx.diagnosis.selection.search_state import Settings
