@@ -14,7 +14,8 @@ from bayessim_mjx.quantities import finite, typeset, unit
 
 MISSING = quantities.MISSING  # where there is no number
 WIDE = 1000  # ratio of an interval's ends, from which on it is not printed in numbers; no source: a matter of style
-UNITS = r"(?<=\d) (?:N m s|N m|noise sd|N|rad|deg|mm|ms|m|s|kg|%)\b|(?<=\d) %"  # that stay with their number
+# that stay with their number
+UNITS = r"(?<=\d) ± (?=[\d−])|(?<=\d) (?:N m|noise sd|N|rad|deg|mm|ms|m|s|kg|%)(?![A-Za-z])|(?<=N m) s(?![A-Za-z])"
 STAGES = {
     "nominal": "as delivered",
     "calibrated": "recalibrated",
@@ -24,11 +25,15 @@ STAGES = {
 }
 
 
-def page(text: Any) -> str:
-    """A sentence as it is printed on a page: `±`, minus signs and superscripts in place of ASCII."""
+def signs(text: Any) -> str:
+    """A sentence with `±`, minus signs and superscripts in place of ASCII."""
     text = re.sub(r"\^(-?\d+)", lambda power: power[1].translate(quantities.SUPERSCRIPT), str(text))
-    text = re.sub(r"(?<![\w.-])-(?=\d)", "−", text.replace(" +- ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}"))
-    return re.sub(UNITS, lambda unit: unit[0].replace(" ", "\N{NO-BREAK SPACE}"), text)
+    return re.sub(r"(?<![\w.-])-(?=\d)", "−", text.replace(" +- ", " ± "))
+
+
+def page(text: Any) -> str:
+    """A sentence as it is printed on a page: with `signs`, and no line break between a number and its unit."""
+    return re.sub(UNITS, lambda tied: tied[0].replace(" ", "\N{NO-BREAK SPACE}"), signs(text))
 
 
 def stages_told(d: Diagnosis) -> dict[str, str]:
@@ -87,7 +92,7 @@ def estimate(mean: Any, sd: Any = math.nan, in_unit: str = "") -> str:
 def quantity(name: str, value: Estimate) -> tuple[str, str]:
     """A parameter's name and value, see `phrases.effects.quantity`."""
     title, text = _quantity(name, value)
-    return title, page(text)
+    return title, signs(text)
 
 
 def not_fitted(d: Diagnosis, most: int | None = None) -> list[str]:

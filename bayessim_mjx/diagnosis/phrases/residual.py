@@ -82,9 +82,7 @@ def located(found: Located) -> list[str]:
 
 def places(found: Located) -> list[Place]:
     """Joints with their shares, and the first region of each."""
-    return [
-        Place(s.joint, s.share, s.ci, region(s.leaves[0].where, s.units) if s.leaves else "") for s in found.spots
-    ]
+    return [Place(s.joint, s.share, s.ci, region(s.leaves[0].where, s.units) if s.leaves else "") for s in found.spots]
 
 
 def region(limits: Iterable[tuple[str, bool, float]], units: Mapping[str, str]) -> str:

@@ -82,7 +82,7 @@ COASTS_CLOSED = " The effects close {closed} of the squared gap of such joints."
 def sentences(d: Diagnosis) -> list[str]:
     """The verdict, most important first; each number is one of the result's."""
     far, basis = d.gap, d.basis
-    texts = [_head(d), *_how_far(d), *_doubts(d), _coasting(far, bool(d.effects)), _probable(basis)]
+    texts = [_head(d), *_how_far(d), *_doubts(d), coasting(far, bool(d.effects)), _probable(basis)]
     ambiguous = [found for found in d.answers if len(found["members"]) > 1]
     texts += [SPLITS.format(name=d.next_experiment["name"])] if any(a["splits"] for a in ambiguous) else []
     them = "it" if len(d.effects) == 1 else "them"
@@ -97,7 +97,7 @@ def sentences(d: Diagnosis) -> list[str]:
     texts += [f"At its bound: {titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
     texts += parameters.remarks(d.parameters)
     texts += [not_on_offer(basis["tried"])] if d.verdict == "unexplained" and basis.get("tried") else []
-    return [text for text in [*texts, _not_tried(basis.get("not_tried"))] if text]
+    return [text for text in [*texts, not_tried(basis.get("not_tried"))] if text]
 
 
 def _head(d: Diagnosis) -> str:
@@ -188,7 +188,7 @@ def _probable(basis: Mapping[str, Any]) -> str:
     return PROBABLE.format(own=percent(chance["answer"]), others=percent(chance["rivals"]), nothing=nothing)
 
 
-def _coasting(far: Gap, named: bool) -> str:
+def coasting(far: Gap, named: bool) -> str:
     """Where no simulator at all predicts better than the recalibrated one."""
     if far.coasting is None or not far.coasting < far.calibrated:
         return ""
@@ -197,7 +197,7 @@ def _coasting(far: Gap, named: bool) -> str:
     return COASTS.format(coasting=number(far.coasting), calibrated=number(far.calibrated), more=more)
 
 
-def _not_tried(short: Mapping[str, Any] | None) -> str:
+def not_tried(short: Mapping[str, Any] | None) -> str:
     """Parts of the search that the time was too short for."""
     if not short:
         return ""

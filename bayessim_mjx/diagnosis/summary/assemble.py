@@ -104,7 +104,7 @@ def basis(found: Findings, verdict: Verdict) -> dict[str, Any]:
         "flexible": residual.flexible_of(top, on) if top is not None else {},
         "efforts": first_look.verdict(found.setup.look),
         "tried": sorted({e.name for e in found.setup.physics.effects}),
-        "not_tried": _not_tried(state),
+        "not_tried": not_tried(state),
     }
 
 
@@ -190,7 +190,7 @@ def not_fitted(state: SearchState) -> dict[str, list[str]]:
     return out
 
 
-def _not_tried(state: SearchState) -> dict[str, Any]:
+def not_tried(state: SearchState) -> dict[str, Any]:
     """Parts of the search that the time was too short for, with the minutes that there were; {} if none."""
     parts = [f"{count} models ({part})" for part, count in state.skipped.items() if part != SINGLES]
     parts = [f"{len(state.cut_short)} single effects", *parts] if state.cut_short else parts

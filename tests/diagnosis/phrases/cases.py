@@ -1,4 +1,4 @@
-"""Results of every kind, made up; `python -m tests.diagnosis.phrases.cases` prints the sentences of all (sentences.txt).
+"""Results of every kind, made up: `python -m tests.diagnosis.phrases.cases` prints their sentences.
 
 Each exists for sentences that no other has. Numbers are chosen so that shares can be checked by hand.
 """
@@ -15,6 +15,7 @@ ROW = {
 }  # fmt: skip
 SHARES = {"nominal": 0.0214, "calibrated": 0.0107, "with_effects": 0.000866}
 CLOSED = {"predicted": 0.66, "realised": 0.98, "elsewhere": 0.97, "nested": True, "ci": (0.9, 1.0)}
+ALONE = CLOSED | {"elsewhere": None, "nested": False}
 LEVEL = Gap(1.0, 21.4, 10.7, 0.866, 0.866, physical={"hinge": ROW}, shares=SHARES, closed=CLOSED)
 NO_EFFECTS = dataclasses.replace(LEVEL, with_effects=LEVEL.calibrated, closed={})
 BASIS = {"window": 0.5, "remains": 0.0, "beaten": False, "above_noise": True}
@@ -39,6 +40,7 @@ DELAY = effect(
     delay=(0.012, 0.001, "s"),
 )  # fmt: skip
 PAYLOAD = effect("payload", "tool", 0.9, [["inertial_parameters@tool"]], mass=(0.99, 0.01, "kg"), com_x=(0.0, 0.1, "m"))
+END = effect("backlash", "hinge", gap=(0.05, 0.0, "rad", "at least"))
 FORCE = {
     "on": "effects", "joints": ["hinge"], "inputs": ["hinge speed", "hinge effort"],
     "held": {"condition": {"significant": True, "closed": 0.75, "at_noise": False},
@@ -80,6 +82,9 @@ def every():
     far |= {"data_sheet": parameters.far_from_data_sheet(1.2, 4.0)}
     moves = {"mean": 1.0, "structural": parameters.moves(0.2, 3), "at_bound": False, "data_sheet": ""}
     same = {"mean": 1.0, "structural": "", "data_sheet": "", "same_as": ["viscous_friction@hinge"]}
+    known = {"hip": stuck, "knee": stuck, "arm": far, "leg": far, "foot": moves, "toe": same}
+    few = {"hip": stuck, "arm": far}
+    short = {"minutes": 5.0, "before": 2.0, "parts": ["3 pairs"]}
     chance = {"answer": 0.9, "rivals": 0.08, "nothing": 1e-9}
     return {
         "no gap": made("no_gap", far=gap(NO_EFFECTS, **quiet), above_noise=False),
@@ -91,21 +96,21 @@ def every():
         "one effect": made("effects", [FRICTION], probability=chance),
         "two effects": made("effects", [FRICTION, GAIN], hidden=["viscous_friction@hinge"]),
         "one law at two joints": made("effects", [FRICTION, dataclasses.replace(FRICTION, where="elbow")]),
-        "one log": made("effects", [FRICTION], gap(closed=CLOSED | {"elsewhere": None, "nested": False}, in_sample=True)),
+        "one log": made("effects", [FRICTION], gap(closed=ALONE, in_sample=True)),
         "a remainder": made("effects", [FRICTION], some),
         "an effect at its bound": made(
             "effects",
-            [dataclasses.replace(effect("backlash", "hinge", gap=(0.05, 0.0, "rad", "at least")), sentence="Gap ends.")],
+            [dataclasses.replace(END, sentence="Gap ends.")],
         ),
         "a class with a number": made("ambiguous", [DELAY], experiment=run, probability=chance),
         "a class without a number": made("ambiguous", [FRICTION, PAYLOAD]),
         "unexplained": made("unexplained", flexible=FORCE | {"on": "recalibrated"}, tried=["coulomb_friction"]),
-        "unexplained by chance": made("unexplained", flexible=NOTHING, not_tried={"minutes": 5.0, "before": 2.0, "parts": ["3 pairs"]}),
+        "unexplained by chance": made("unexplained", flexible=NOTHING, not_tried=short),
         "partly": made("unexplained", [FRICTION], some, remains=0.2, flexible=FORCE),
         "nearest": made("unexplained", [GAIN], gap(with_effects=6.0), beaten=True, far_off=(3, 6)),
         "beside joints that keep their speed": made("unexplained", [GAIN], gap(with_effects=6.0, coasting=5.0)),
-        "known parameters": made("effects", [FRICTION], parameters={"hip": stuck, "knee": stuck, "arm": far, "leg": far, "foot": moves, "toe": same}, builds_up=3.0),
-        "one parameter": made("effects", [FRICTION], parameters={"hip": stuck, "arm": far}, efforts="the motors follow their commands"),
+        "known parameters": made("effects", [FRICTION], parameters=known, builds_up=3.0),
+        "one parameter": made("effects", [FRICTION], parameters=few, efforts="the motors follow"),
     }  # fmt: skip
 
 

@@ -20,7 +20,7 @@ PRIVATE = re.compile(
 OWN = ("diagnosis/phrases", "diagnosis/summary", "diagnosis/result.py", "report")
 OTHERS = ("finer_steps.py", "whole_logs.py", "verdict.py")  # of the summary: their notes are counted with the rest
 # strings outside of the room of words that a user may read, with a private term: they may fall, never rise
-MOST_ELSEWHERE = 40
+MOST_ELSEWHERE = 9
 TITLE = "What would have been missed"  # of a blind check's section
 
 

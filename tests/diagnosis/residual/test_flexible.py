@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.residual import flexible as f
 from bayessim_mjx.diagnosis.phrases.residual import flexible, flexible_of
+from bayessim_mjx.diagnosis.residual import flexible as f
 from tests.diagnosis.missing_forces import fitted, record
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
