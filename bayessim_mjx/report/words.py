@@ -7,10 +7,10 @@ from typing import Any
 
 from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.gap import of_rms
-from bayessim_mjx.diagnosis.phrases.effects import label_title
+from bayessim_mjx.diagnosis.phrases.effects import label_title, measured
 from bayessim_mjx.diagnosis.phrases.effects import quantity as _quantity
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate
-from bayessim_mjx.quantities import finite, typeset, unit
+from bayessim_mjx.quantities import finite, typeset
 
 MISSING = quantities.MISSING  # where there is no number
 WIDE = 1000  # ratio of an interval's ends, from which on it is not printed in numbers; no source: a matter of style
@@ -82,11 +82,8 @@ def percent(share: Any, sign: bool = False) -> str:
 
 
 def estimate(mean: Any, sd: Any = math.nan, in_unit: str = "") -> str:
-    """`0.0312 ± 0.0021 N m`, see `quantities.estimate`; seconds below 0.5 as ms."""
-    if in_unit == "s" and finite(mean) and abs(mean) < 0.5:
-        mean, sd, in_unit = 1e3 * mean, 1e3 * sd if finite(sd) else sd, "ms"
-    tail = f" {unit(in_unit)}" if in_unit else ""
-    return typeset(quantities.estimate(mean, sd)) + tail
+    """`0.0312 ± 0.0021 N m`, see `phrases.effects.measured`."""
+    return signs(measured(mean, sd, in_unit))
 
 
 def quantity(name: str, value: Estimate) -> tuple[str, str]:

@@ -317,4 +317,4 @@ def reason(scorer: Scorer, chosen: Scored | None, labels: Sequence[str], contest
         return phrases.sharpens(action, *change) if useful else phrases.sharpens_little(chosen.name, *change)
     if not useful:
         return phrases.separates_nobody(labels, chosen.name, chosen.evidence, instead(scorer.models))
-    return phrases.tells_apart(action, labels, chosen.evidence, contested)
+    return phrases.tells_apart(action, labels, chosen.evidence, contested, BUDGET.mild)

@@ -26,10 +26,10 @@ RECIPROCALS = {
     "slowness": "largest rate",
 }
 WRONG = "the true "  # begins the words for an effect whose number the simulator has, but not right
-SHOWN = 2  # numbers of one effect in a sentence; no source: a matter of style
-PLACES = 6  # of one law in a sentence; no source: a matter of style
-CLEAR = 2.0  # standard deviations from neutral: one normal number in 22 is further away by chance
-SHORT = 0.5  # s; shorter times are written in ms; no source: a matter of style
+MOST = 6  # things that a sentence lists: all joints of an arm; a rule of thumb
+# standard deviations from neutral, or from the data sheet: one normal number in 22 is further away by chance; false
+# reports of fitted values were not counted
+CLEAR = 2.0
 
 
 def missing(name: str, where: str) -> str:
@@ -69,8 +69,8 @@ def all_of(effects: Iterable[Sequence[str]]) -> str:
 
 
 def measured(mean: Any, sd: Any = None, unit: str = "") -> str:
-    """`0.1497 +- 0.0087 N m`, rounded by its standard deviation; short times in ms."""
-    if unit == "s" and finite(mean) and abs(mean) < SHORT:
+    """`0.1497 +- 0.0087 N m`, rounded by its standard deviation; times below a second in ms."""
+    if unit == "s" and finite(mean) and abs(mean) < 1:
         mean, sd, unit = 1e3 * mean, 1e3 * sd if finite(sd) else sd, "ms"
     text = quantities.estimate(mean, sd if finite(sd) else float("nan")).replace("±", "+-")
     return f"{text} {unit}".rstrip()
@@ -78,7 +78,7 @@ def measured(mean: Any, sd: Any = None, unit: str = "") -> str:
 
 def spanned(mean: float, low: float, high: float, unit: str) -> str:
     """`4.76 ms (90 %: 4.21 to 5.30)`, rounded by the width of the interval."""
-    if unit == "s" and abs(mean) < SHORT:
+    if unit == "s" and abs(mean) < 1:
         mean, low, high, unit = 1e3 * mean, 1e3 * low, 1e3 * high, "ms"
     places = quantities.DIGITS - 1 - quantities.power(high - low)
     size, least, most = (quantities.fixed(x, places) for x in (mean, low, high))
@@ -110,7 +110,7 @@ def _turned(text: str) -> str:
 def numbered(effect: FoundEffect) -> str:
     """An effect with its place and numbers, after "the simulator lacks": `a command delay of 12.1 +- 0.4 ms at motor`.
 
-    Of several numbers those that are clearly away from neutral, two at most; the table has all.
+    Of several numbers those that are clearly away from neutral; the table has all.
     """
     own = words(effect.name)
     name = own.noun if own.lacks.startswith(WRONG) else own.lacks
@@ -123,8 +123,7 @@ def numbered(effect: FoundEffect) -> str:
 
 def _numbers(effect: FoundEffect) -> str:
     clear = [quantity(k, v) for k, v in effect.parameters.items() if _clear(effect.name, k, v)]
-    numbers = [f"{k} {v}" for k, v in clear[:SHOWN]]
-    return ", ".join([*numbers, f"{len(clear) - SHOWN} more"] if len(clear) > SHOWN else numbers)
+    return ", ".join(f"{k} {v}" for k, v in clear)
 
 
 def _clear(effect: str, name: str, value: Estimate) -> bool:
@@ -165,7 +164,7 @@ def _law(effects: Sequence[FoundEffect]) -> str:
         return numbered(effects[0])
     own = words(effects[0].name)
     each = [own.at(e.where, quantity(*next(iter(e.parameters.items())))[1]) for e in effects]
-    return f"{own.lacks} of {listed(each, most=PLACES)}"
+    return f"{own.lacks} of {listed(each, most=MOST)}"
 
 
 def line(effect: FoundEffect) -> str:

@@ -10,8 +10,6 @@ from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import listed
 
 __all__ = ["model_title"]
-DECIDED = 10.0  # nats that decide between two models: odds of 22 000, whatever the prior; the same as `Budget.mild`
-AGAIN = 1.3  # times DECIDED, from which on a repetition is advised: a rule of thumb
 
 
 def known_payload(mass: float, place: str) -> tuple[str, str]:
@@ -68,10 +66,10 @@ def separates_nobody(labels: Sequence[str], best: str, evidence: float, help: st
     return f"no safe excitation separates {_apart(labels)} ({most}); these would: {help}"
 
 
-def tells_apart(action: str, labels: Sequence[str], evidence: float, contested: bool) -> str:
-    """The models that an experiment separates; contested: whether the logs left it open."""
-    weak = DECIDED / max(evidence, 1e-9)
-    again = f"; repeat it {math.ceil(weak)} times for a decision" if AGAIN < weak <= DECIDED else ""
+def tells_apart(action: str, labels: Sequence[str], evidence: float, contested: bool, decides: float) -> str:
+    """The models that an experiment separates; contested: whether the logs left it open; decides: nats that do."""
+    times = math.ceil(decides / max(evidence, 1e-9))
+    again = f"; repeat it {times} times for a decision" if 1 < times <= decides else ""
     whom = f"separates {_apart(labels)}" if contested else f"confirms {_apart(labels, 'against')}"
     return f"{action}: {whom}, expected evidence {nats(evidence)} nats{again}"
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Joint, Look
+from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.equation_error.search import Proposal
 from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel
-from bayessim_mjx.diagnosis.phrases.effects import any_of, measured, titled
+from bayessim_mjx.diagnosis.phrases.effects import MOST, any_of, measured, titled
 from bayessim_mjx.quantities import listed, percent
 
-FEW = 4  # places that are listed; no source: a matter of style
 ROUGH = 0.05  # of an effort, rms: smaller residuals are not reported; a rule of thumb
 
 
@@ -26,7 +25,7 @@ def lines(look: Look) -> list[str]:
         out.append(f"together these guesses explain {percent(look.explained)} of the squared residual effort")
     if look.shifts:
         moved = [f"{s.what} of {s.where} {percent(s.share, sign=True)} ({abs(s.away):.1f} sd)" for s in look.shifts]
-        out.append(f"known parameters far from the data sheet: {listed(moved, most=FEW)}")
+        out.append(f"known parameters far from the data sheet: {listed(moved, most=MOST)}")
     if look.unit != 1.0:
         out.append(f"the logged efforts have another unit: 1 of it is about {look.unit:.3g} of the model's")
     # a sound channel contradicts many effects for one reason, which the channel's line gives
@@ -36,7 +35,7 @@ def lines(look: Look) -> list[str]:
         if label.startswith("actuator_gain@")
     ]
     if look.identifiability and look.identifiability.unknown:
-        names = listed(look.identifiability.unknown, most=FEW)
+        names = listed(look.identifiability.unknown, most=MOST)
         out.append(f"these logs determine the mass of {names} no better than the data sheet does")
     return out
 
@@ -77,11 +76,11 @@ def _channels(every: Sequence[Channel]) -> str:
         echo = "; the logged effort is the command itself, not a measurement" if any(c.echo for c in found) else ""
         return f"command -> effort: {low:.2f} to {high:.2f} of the command, at most {late:.0f} ms late{echo}"
     parts = [
-        f"{c.actuator} {c.scale:.2f} of it, {1e3 * c.late:.0f} ms late, {percent(c.left)} otherwise" for c in off[:FEW]
+        f"{c.actuator} {c.scale:.2f} of it, {1e3 * c.late:.0f} ms late, {percent(c.left)} otherwise" for c in off[:MOST]
     ]
     others = len(found) - len(off)
     rest = f"; {others} as commanded" if others else ""
-    more = f"; {len(off) - FEW} more" if len(off) > FEW else ""
+    more = f"; {len(off) - MOST} more" if len(off) > MOST else ""
     return f"command -> effort: not as commanded: {'; '.join(parts)}{more}{rest}"
 
 
@@ -92,19 +91,15 @@ def _mechanism(look: Look) -> str:
     worst = sorted(look.joints, key=lambda j: -j.nominal)
     if worst[0].nominal < ROUGH:
         return f"{name}: the model explains the motion of every joint to {percent(worst[0].nominal)} of the effort"
-    parts = [f"{j.name} {percent(j.nominal)}{_needs(j)}" for j in worst[:FEW] if j.nominal >= ROUGH]
+    off = {j.name: f" (measured / model = {j.needs:.2f})" for j in worst if abs(j.needs - 1) > ROUGH}  # NaN: unknown
+    parts = [f"{j.name} {percent(j.nominal)}{off.get(j.name, '')}" for j in worst[:MOST] if j.nominal >= ROUGH]
     after = max(j.left for j in look.joints)
     tail = f"; at most {percent(after)} with the guesses below" if look.proposals else ""
     return f"{name}: effort that the model does not explain (rms): {', '.join(parts)}{tail}"
 
 
-def _needs(j: Joint) -> str:
-    known = math.isfinite(j.needs) and abs(j.needs - 1) > ROUGH
-    return f" (measured / model = {j.needs:.2f})" if known else ""
-
-
 def _proposal(p: Proposal) -> str:
     each = ((k.replace("_", " "), v, p.deviations[k]) for k, v in p.parameters.items() if v)
     numbers = ", ".join(f"{k} {measured(v, sd if sd < 1e6 else None)}" for k, v, sd in each)
-    rivals = any_of(p.rivals, FEW)
+    rivals = any_of(p.rivals, MOST)
     return f"first guess: {titled(p.term.effect, p.term.where)}: {numbers}{f'; or {rivals}' if rivals else ''}"

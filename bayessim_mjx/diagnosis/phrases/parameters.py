@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bayessim_mjx.diagnosis.phrases.effects import any_of
+from bayessim_mjx.diagnosis.phrases.effects import MOST, any_of
 from bayessim_mjx.quantities import listed
 
-MOST = 6  # effects that a sentence lists; no source: a matter of style
 STUCK = "At a bound: {named}. They stand in for something missing, or their ranges are too narrow."
 FAR = "Far from the data sheet: {named}."
 STANDS_FOR = (

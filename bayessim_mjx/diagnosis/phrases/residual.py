@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.diagnosis.gap import Gap, of_one
+from bayessim_mjx.diagnosis.phrases.effects import MOST
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
 from bayessim_mjx.diagnosis.residual.frequency import Heard
@@ -23,7 +24,6 @@ AXES = {
 OPPOSITES = ("against/with", "more/less")  # of which a number's sign chooses one
 # shares of the gain: of an input, of the largest joint's; less is not named; rules of thumb
 IMPORTANT, ACTS = 0.1, 0.2
-INPUTS = 4  # that are named at most; no source: a matter of style
 SEEN = 0.02  # control periods: shorter lags are not reported; a rule of thumb
 NEAR = 1.1  # ratio of frequencies that count as the same line; a rule of thumb
 
@@ -183,7 +183,7 @@ def flexible_of(found: Flexible, on: str) -> dict[str, Any]:
         held[name] = {"significant": bool(own.significant), "closed": gap.closed, "at_noise": at_noise}
     least = IMPORTANT * max(found.depends_on[0]["importance"], 0.5)
     joints = [j for j, share in found.where.items() if share > ACTS * max(found.where.values())]
-    inputs = [d["input"] for d in found.depends_on if d["importance"] > least][:INPUTS]
+    inputs = [d["input"] for d in found.depends_on if d["importance"] > least][:MOST]
     return {"on": on, "held": held, "joints": joints, "inputs": inputs}
 
 

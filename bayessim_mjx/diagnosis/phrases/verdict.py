@@ -7,22 +7,10 @@ from typing import Any
 
 from bayessim_mjx.diagnosis import tolerance
 from bayessim_mjx.diagnosis.gap import of_one, of_rms
+from bayessim_mjx.diagnosis.phrases import effects as named
 from bayessim_mjx.diagnosis.phrases import parameters, residual
-from bayessim_mjx.diagnosis.phrases.effects import (
-    answer,
-    any_of,
-    capital,
-    lacking,
-    line,
-    not_on_offer,
-    titled,
-)  # fmt: skip
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
 from bayessim_mjx.quantities import extent, finite, listed, percent
-
-JOINTS = 6  # joints, or effects, that a sentence lists; no source: a matter of style
-SELDOM = 1e-6  # a smaller probability has no number; no source: a matter of style
-
 
 HEADS = {
     "no_gap": "No gap above the noise: the logs differ from the simulator by {nominal}.",
@@ -88,15 +76,15 @@ def sentences(d: Diagnosis) -> list[str]:
     them = "it" if len(d.effects) == 1 else "them"
     members = {label for a in d.answers for m in a["members"] for label in m["effects"]}
     hidden = [label for label in d.hidden if label not in members]  # a class already says that they are not separated
-    texts += [HIDDEN.format(them=them, hidden=any_of(hidden, JOINTS))] if hidden else []
+    texts += [HIDDEN.format(them=them, hidden=named.any_of(hidden, named.MOST))] if hidden else []
     texts += _noise(d)
     if d.verdict == "unexplained" and basis.get("flexible"):
         texts += residual.flexible(basis["flexible"], far.in_sample)
     if basis.get("efforts"):
         texts.append(f"By the logged efforts alone, {basis['efforts']}.")
-    texts += [f"At its bound: {titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
+    texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
     texts += parameters.remarks(d.parameters)
-    texts += [not_on_offer(basis["tried"])] if d.verdict == "unexplained" and basis.get("tried") else []
+    texts += [named.not_on_offer(basis["tried"])] if d.verdict == "unexplained" and basis.get("tried") else []
     return [text for text in [*texts, not_tried(basis.get("not_tried"))] if text]
 
 
@@ -107,13 +95,13 @@ def _head(d: Diagnosis) -> str:
         quoted = {"no_gap": far.nominal, "parameters": far.calibrated}.get(d.verdict)
         above = quoted is not None and not of_one(quoted**2).at_noise
         head = HEADS["no_gap"].partition(": ")[2] if above and d.verdict == "no_gap" else HEADS[d.verdict]
-        return capital((head + SMALL * above).format(**fill))
+        return named.capital((head + SMALL * above).format(**fill))
     if d.verdict == "unexplained":
-        return (PARTLY_HEAD if far.beyond else HEADS["unexplained"]).format(named=lacking(d.effects), **fill)
+        return (PARTLY_HEAD if far.beyond else HEADS["unexplained"]).format(named=named.lacking(d.effects), **fill)
     several = {a["effect"]: a for a in d.answers if len(a["members"]) > 1}
-    open_ = [answer(e, several[label]) for e in d.effects if (label := f"{e.name}@{e.where}") in several]
+    open_ = [named.answer(e, several[label]) for e in d.effects if (label := f"{e.name}@{e.where}") in several]
     sure = [e for e in d.effects if f"{e.name}@{e.where}" not in several]
-    parts = [capital(lacking(sure)) + "."] if sure else []
+    parts = [named.capital(named.lacking(sure)) + "."] if sure else []
     return " ".join([*parts, *open_, *([REST.format(**fill)] if far.beyond else [])])
 
 
@@ -142,7 +130,7 @@ def _how_far(d: Diagnosis) -> list[str]:
     left = of_rms(far.calibrated, far.with_effects).left
     if d.effects:
         nearest = d.verdict == "unexplained" and not far.beyond
-        out += [NEAREST.replace("{nearest}", "; ".join(map(line, d.effects)))] if nearest else []
+        out += [NEAREST.replace("{nearest}", "; ".join(map(named.line, d.effects)))] if nearest else []
         out.append(FALLS)
         if d.verdict == "unexplained":
             remains = basis.get("remains") or 0.0
@@ -184,7 +172,8 @@ def _probable(basis: Mapping[str, Any]) -> str:
     chance = basis.get("probability")
     if not chance:
         return ""
-    nothing = percent(chance["nothing"]) if chance["nothing"] > SELDOM else "less than one in a million"
+    nothing = percent(chance["nothing"])
+    nothing = nothing if nothing.strip("0. %") else "less than one in a million"  # by the digits of `percent`
     return PROBABLE.format(own=percent(chance["answer"]), others=percent(chance["rivals"]), nothing=nothing)
 
 
@@ -263,9 +252,10 @@ def _by_joint(far: Gap, effects: bool) -> str:
     words = "recalibrated and with the effects" if effects else "as delivered and recalibrated"
     names = _worst(far)
     rows = [
-        f"{n} {', '.join(extent(far.physical[n][s], far.physical[n]['unit']) for s in stages)}" for n in names[:JOINTS]
+        f"{n} {', '.join(extent(far.physical[n][s], far.physical[n]['unit']) for s in stages)}"
+        for n in names[: named.MOST]
     ]
-    more = f"; {len(names) - JOINTS} more in the table" if len(names) > JOINTS else ""
+    more = f"; {len(names) - named.MOST} more in the table" if len(names) > named.MOST else ""
     return f"By joint, {words}: {'; '.join(rows)}{more}."
 
 

@@ -29,7 +29,6 @@ from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
 from bayessim_mjx.logs.log import Channels
 
-LATE = 0.25  # of the time: if more was over before the search, a sentence says so; a rule of thumb
 PACKAGES = ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")  # what the result depends on
 
 
@@ -195,8 +194,7 @@ def not_tried(state: SearchState) -> dict[str, Any]:
     parts = [f"{count} models ({part})" for part, count in state.skipped.items() if part != SINGLES]
     parts = [f"{len(state.cut_short)} single effects", *parts] if state.cut_short else parts
     budget = state.settings.budget
-    before = budget.fixed / 60 if budget.fixed > LATE * budget.seconds else 0.0
-    return {"minutes": budget.seconds / 60, "before": before, "parts": parts} if parts else {}
+    return {"minutes": budget.seconds / 60, "before": budget.fixed / 60, "parts": parts} if parts else {}
 
 
 def _reason(state: SearchState, label: str, gains: dict[str, float]) -> str:

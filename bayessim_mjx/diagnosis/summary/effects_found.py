@@ -19,7 +19,8 @@ from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
 
 # operating conditions, from which on closure is quoted of conditions that the choice was made without: without one of
-# two, a single one is left to choose by, which tells no standard error over conditions
+# two, a single one is left to choose by, which has no standard error over conditions (n - 1 = 0 degrees of freedom);
+# source: Student's t
 LEAST = 3
 UNKNOWN = 0.5  # of its range: a larger standard deviation than a uniform prior's, .29, says nothing; a rule of thumb
 

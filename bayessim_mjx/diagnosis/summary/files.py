@@ -28,7 +28,6 @@ from bayessim_mjx.diagnosis.summary import assemble
 from bayessim_mjx.errors import UserError
 
 PRELIMINARY = "preliminary.json"  # results while the search goes on
-BEST = 20  # models listed there
 SEARCH = "search_so_far"  # folder of the fits
 COMMAND = "next_experiment.csv"
 
@@ -115,8 +114,7 @@ def _so_far(state: SearchState) -> dict[str, Any]:
     fit, calibrated = state.base.fit, state.gap(state.base)
     nominal, _ = state.nominal.quadratic(state.fitter.spread)
     best = [
-        {k: row[k] for k in ("label", "score", "se", "gap_closed", "parameters")}
-        for row in assemble.ranking(state)[:BEST]
+        {k: row[k] for k in ("label", "score", "se", "gap_closed", "parameters")} for row in assemble.ranking(state)
     ]
     return {
         "gap": {"nominal": of_one(float(nominal.c.sum()), calibrated.noise).rms, "calibrated": calibrated.rms},

@@ -13,12 +13,10 @@ from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.phrases import parameters as phrases
+from bayessim_mjx.diagnosis.phrases.effects import CLEAR
 from bayessim_mjx.diagnosis.selection.models import Model
 
 Array = NDArray[np.float64]
-# standard deviations from the data sheet from which on a parameter is reported: one normal value in 22 by chance. False
-# reports of fitted values were not counted.
-FAR = 2.0
 
 
 def parameters(selection: Selection, model: Model, sd: np.ndarray, mean: np.ndarray) -> dict[str, dict[str, Any]]:
@@ -39,9 +37,9 @@ def parameters(selection: Selection, model: Model, sd: np.ndarray, mean: np.ndar
 
 
 def _against_data_sheet(c: Coordinate, value: float, precision: float) -> dict[str, Any]:
-    """The distance of a known parameter from its stated value, in words and in sd, if it is larger than `FAR`."""
+    """The distance of a known parameter from its stated value, in words and in sd, if it is larger than `CLEAR`."""
     away = abs(value - c.neutral) * precision**0.5
-    if not (c.stated and away > FAR):
+    if not (c.stated and away > CLEAR):
         return {"data_sheet": ""}
     return {"data_sheet": phrases.far_from_data_sheet(value, away), "away": away}
 

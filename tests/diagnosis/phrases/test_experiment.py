@@ -14,11 +14,11 @@ def test_why_an_experiment_is_proposed():
     assert action == "run a chirp on elbow for 10 s" and phrases.run_experiment("release", 3.0).startswith(
         "run release"
     )
-    assert phrases.tells_apart(action, titles, 4.04, contested=True) == (
+    assert phrases.tells_apart(action, titles, 4.04, True, 10.0) == (
         f"{action}: separates {titles[0]} from {titles[1]} and {titles[2]}, expected evidence 4.0 nats; "
         "repeat it 3 times for a decision"
     )
-    text = phrases.tells_apart(action, titles[:2], 25.2, contested=False)
+    text = phrases.tells_apart(action, titles[:2], 25.2, False, 10.0)
     assert text == f"{action}: confirms {titles[0]} against {titles[1]}, expected evidence 25 nats"
     text = phrases.separates_nobody(titles[:2], "release", 0.02, "more")
     assert text.endswith("(the best, release, is expected to give 0.0 nats); these would: more")
