@@ -53,7 +53,7 @@ def test_shares(share, text):
 
 
 def test_units_have_superscripts():
-    assert words.unit("N m s^2/rad^2") == "N m s²/rad²" and words.unit("N m/rad^3") == "N m/rad³"
+    assert words.signs("N m s^2/rad^2") == "N m s²/rad²" and words.signs("N m/rad^3") == "N m/rad³"
 
 
 def test_effects_in_plain_english():
