@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bayessim_mjx.diagnosis.result import Diagnosis
+from bayessim_mjx.diagnosis.verdicts import Verdict as Title
 
 
 @dataclass(frozen=True)
@@ -20,45 +21,45 @@ class Verdict:
 
 VERDICTS = {
     "no_gap": Verdict(
-        "No gap",
+        Title.NO_GAP.words,
         "The simulator reproduces the logs as well as their noise allows.",
         "Train on the simulator as it is. These logs say nothing about other motions: log those too.",
     ),
     "parameters": Verdict(
-        "Parameters only",
+        Title.PARAMETERS.words,
         "Recalibrated parameters close the gap.",
         "Use the recalibrated parameters: effects.yaml holds them. These logs need no effect.",
     ),
     "noise": Verdict(
-        "Noise larger than estimated",
+        Title.NOISE.words,
         "No model and no force predicts the residual, and it has the covariance of sensor noise.",
         "Use the recalibrated parameters: effects.yaml holds them. State the noise of the sensors (sigma: in the logs' "
         "metadata), or repair them. These logs need no effect.",
     ),
     "effects": Verdict(
-        "Missing effects found",
+        Title.EFFECTS.words,
         "The simulator lacks effects that these logs identify.",
         "Train with the corrected simulator: effects.yaml, or model_with_effects.xml in plain MuJoCo.",
     ),
     "ambiguous": Verdict(
-        "Ambiguous",
+        Title.AMBIGUOUS.words,
         "Several explanations fit these logs equally well.",
         "Run the next experiment: it separates the explanations. Until then, randomise over all of them.",
     ),
     "unexplained": Verdict(
-        "Unexplained",
+        Title.UNEXPLAINED.words,
         "A part of the gap is reproducible, but no effect of the library explains it.",
         "See below where the remaining force acts, and write its cause as an effect of your own "
         "(--effects file.py:Name).",
     ),
     "insufficient_data": Verdict(
-        "Too little data",
+        Title.INSUFFICIENT_DATA.words,
         "These logs do not allow a diagnosis.",
         "Repair or extend the logs as the warnings say, and diagnose again.",
     ),
 }
 ALIKE = Verdict(
-    "Ambiguous",
+    Title.AMBIGUOUS.words,
     VERDICTS["ambiguous"].headline,
     "Randomise over all explanations, or log another motion: none was found here that separates them.",
 )
