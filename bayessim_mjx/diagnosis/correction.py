@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx import effects as library
+from bayessim_mjx import quantities
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.effects.effect import Effect, Quantity, in_order, layout
 from bayessim_mjx.effects.support import native, storage
@@ -36,6 +37,10 @@ class Estimate:
     sd: float
     unit: str = ""
     bound: str = ""
+
+    def __str__(self) -> str:
+        """`0.1191 +- 0.0016 N m`: rounded by the standard deviation."""
+        return f"{quantities.estimate(self.mean, self.sd).replace('±', '+-')} {self.unit}".rstrip()
 
 
 @dataclasses.dataclass(frozen=True)

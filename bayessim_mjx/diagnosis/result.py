@@ -77,7 +77,7 @@ class Diagnosis:
 
     Attributes:
         verdict: a `Verdict`, or its code; sentences: the verdict in words, most important first.
-        parameters: {name: {"mean", "sd", "nominal", "low", "high", "unit", "structural": sentence or "",
+        parameters: {name: {"mean", "sd", "nominal", "low", "high", "unit", "structural": sentence or "", "at_bound",
             "data_sheet": sentence or "", "away": sd from the data sheet, where that is far,
             "simulated": value that fits at the simulator's time step; "mean" is the robot's,
             "same_as": effects ("name@place") that its deviation from the data sheet may stand for}}.
@@ -91,6 +91,16 @@ class Diagnosis:
             numbers as a share, its 90 % interval, and how many numbers; of kinds whose accuracy nobody stated.
         evidence: sets of effects, most likely first: [{"effects": [label ...], "probability", "nats" of evidence and
             prior over the known parameters alone}].
+        answers: of each effect {"effect": label, "members": [{"effects": [label ...], "probability"}], the explanations
+            that these logs do not separate, the named one first, "number": `FoundEffect.shared`, "splits": name of the
+            experiment that separates them, or ""}.
+        basis: numbers behind the sentences: {"window": s, "remains": share of the recalibrated simulator's gap that a
+            flexible force closes on top of the effects, "beaten": whether it does better than they do alone,
+            "noise_memory": s of the sensors' noise, or None, "far_off": (known parameters far off, of so many),
+            "builds_up": times the likely error over whole logs, "above_noise": whether recalibration leaves more than
+            noise, "probability": {"answer", "rivals", "nothing"}, "flexible": `phrases.residual.flexible_of`,
+            "efforts": clause on the logged efforts, "tried": names of effects, "not_tried": {"minutes", "before",
+            "parts"}}.
         next_experiment: {"name", "why", "evidence", "file", "table": [...]} or {}.
         details: numbers for pictures (see `report`); not part of diagnosis.json but saved beside it.
     """
@@ -112,6 +122,8 @@ class Diagnosis:
     hidden: list[str] = field(default_factory=list)
     accuracy: dict[str, dict[str, float]] = field(default_factory=dict)
     evidence: list[dict[str, Any]] = field(default_factory=list)
+    answers: list[dict[str, Any]] = field(default_factory=list)
+    basis: dict[str, Any] = field(default_factory=dict)
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:

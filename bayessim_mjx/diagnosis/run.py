@@ -21,13 +21,14 @@ from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
 from bayessim_mjx.diagnosis.fitting.journal import Journal, Remembering, digest
 from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, robot_of
+from bayessim_mjx.diagnosis.phrases import first_look
 from bayessim_mjx.diagnosis.request import Effects, Request
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.diagnosis.selection import budget
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.setup import Setup, prepare
 from bayessim_mjx.diagnosis.stages import STAGES, Stage, carry_out
-from bayessim_mjx.diagnosis.summary import assemble, first_look
+from bayessim_mjx.diagnosis.summary import assemble
 from bayessim_mjx.diagnosis.summary.files import Files
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Log

@@ -6,25 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.diagnosis.phrases.advice import headline, verdict_of
+from bayessim_mjx.diagnosis.phrases.effects import candidate_title, line
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.monitor.style import new_figure
 from bayessim_mjx.monitor.writer import TensorBoard
-from bayessim_mjx.report.gap_figures import PARTS, part_words, squares
+from bayessim_mjx.quantities import finite, unit
+from bayessim_mjx.report.gap_figures import falls, part_words, squares
 from bayessim_mjx.report.look import DASH, FAINT, STAGE
-from bayessim_mjx.report.words import (
-    STAGES,
-    candidate_title,
-    effect_line,
-    finite,
-    gap_closed,
-    headline,
-    number,
-    percent,
-    repeated,
-    stages_of,
-    unit,
-    verdict_of,
-)
+from bayessim_mjx.report.words import STAGES, gap_closed, number, percent, repeated, stages_of
 
 SHOWN = 4  # overlays in one picture
 LINES = {"solid": "-", "dash": "--", "dot": ":"}
@@ -54,7 +44,7 @@ def scalars(d: Diagnosis) -> dict[str, float]:
 
 
 def _markdown(d: Diagnosis) -> str:
-    lines = [f"**{verdict_of(d).badge}.** {headline(d)}", *d.sentences[1:], *map(effect_line, d.effects)]
+    lines = [f"**{verdict_of(d).badge}.** {headline(d)}", *d.sentences[1:], *map(line, d.effects)]
     return "\n\n".join(lines + [f"Warning: {w}" for w in d.warnings])
 
 
@@ -80,7 +70,7 @@ def waterfall(level: Mapping[str, float], stages: Mapping[str, Any]) -> Any:
     axes = figure.subplots()
     bars = [("as delivered", 0.0, level["nominal"], "nominal", number(stages["nominal"]))]
     before, last = level["nominal"], "with_effects" if "with_effects" in level else "calibrated"
-    for stage in (s for s in PARTS if s in level):
+    for stage in falls(level):
         change = level[stage] - before
         low = min(before, level[stage])
         bars.append(

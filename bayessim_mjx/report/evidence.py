@@ -3,12 +3,14 @@
 from collections.abc import Mapping
 from typing import Any
 
+from bayessim_mjx.diagnosis.phrases.effects import label_title
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.diagnosis.statistics import Z90
+from bayessim_mjx.quantities import finite, unit
 from bayessim_mjx.report import marks, motion_figures, rival_figures
 from bayessim_mjx.report.choice import choice
 from bayessim_mjx.report.look import STAGE
-from bayessim_mjx.report.words import accuracy, estimate, finite, known_span, label_title, number, percent, unit
+from bayessim_mjx.report.words import accuracy, estimate, known_span, number, percent
 
 OVERLAY_NUMBERS = 90_000  # in all overlays together, so that the page stays a few MB
 FEWEST_POINTS = 200

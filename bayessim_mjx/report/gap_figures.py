@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from bayessim_mjx.diagnosis.phrases.effects import label_title
+from bayessim_mjx.quantities import finite
 from bayessim_mjx.report.look import (
     FAINT,
     HATCH,
@@ -15,7 +17,7 @@ from bayessim_mjx.report.look import (
     note,
     text,
 )
-from bayessim_mjx.report.words import STAGES, finite, known_span, label_title, number, percent
+from bayessim_mjx.report.words import STAGES, known_span, number, percent
 
 # what takes the squared gap down to each stage
 PARTS = {
@@ -46,6 +48,16 @@ def _largest(stages: Mapping[str, Any]) -> float:
     return float(max(stages[s] for s in STEPS))
 
 
+def falls(level: Mapping[str, float]) -> list[str]:
+    """Stages that have a bar of their own: a floor only where it lies below the stage before.
+
+    A model that predicts below the estimated noise leaves nothing unexplained; the noise was estimated too large.
+    """
+    known = [s for s in PARTS if s in level]
+    floors = ("reducible_floor", "noise_floor")
+    return [s for k, s in enumerate(known) if s not in floors or level[s] < level[known[k - 1]]]
+
+
 def part_words(stage: str, level: Mapping[str, float], floor: str = "") -> str:
     """What is between a stage and the one before."""
     return FLOORS[floor] if stage == "noise_floor" and "reducible_floor" in level else PARTS[stage]
@@ -69,7 +81,7 @@ def waterfall(
     columns = [_total("as delivered", "nominal", stages, level, ci), _drop("calibrated", level)]
     columns += _effects(shares, level) if effects else []
     columns += [_total(words, last, stages, level, ci)]
-    columns += [_drop(s, level, stages.get("floor", "")) for s in ("reducible_floor", "noise_floor") if s in level]
+    columns += [_drop(s, level, stages.get("floor", "")) for s in falls(level)[falls(level).index(last) + 1 :]]
     columns += [_total("measurement noise", "noise_floor", stages, level, ci)] if "noise_floor" in level else []
     xs = list(range(len(columns)))
     tops = [min(c["base"] + c["height"] + c["error"][1], HIGHEST) for c in columns]

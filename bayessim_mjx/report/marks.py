@@ -5,7 +5,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-from bayessim_mjx.report.words import finite, known_span
+from bayessim_mjx.quantities import finite
+from bayessim_mjx.report.words import known_span
 
 WIDTH, HEIGHT, PAD = 190, 18, 6
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.quantities import finite, unit
 from bayessim_mjx.report.look import (
     DASH,
     FAINT,
@@ -20,7 +21,7 @@ from bayessim_mjx.report.look import (
     panel,
     text,
 )
-from bayessim_mjx.report.words import STAGES, finite, unit
+from bayessim_mjx.report.words import STAGES
 
 
 def _condition(row: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.report import evidence, sections
 from bayessim_mjx.report.look import COLUMN, STAGE, WIDTH
-from bayessim_mjx.report.words import STAGES, not_fitted
+from bayessim_mjx.report.words import STAGES, not_fitted, page
 
 TEMPLATE = "template.html.j2"
 
@@ -22,12 +22,12 @@ def write(diagnosis: Diagnosis, folder: str | Path, missed: Any = None) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "report.html"
     link = Path(os.path.relpath(missed.page, folder.resolve())).as_posix() if missed else ""
-    path.write_text(render(diagnosis, missed, link), encoding="utf-8")
+    path.write_text(render(diagnosis, missed, link, folder), encoding="utf-8")
     return path
 
 
-def render(d: Diagnosis, missed: Any = None, link: str = "") -> str:
-    """The page as text; `link`: to the page of the blind check, from where this one lies."""
+def render(d: Diagnosis, missed: Any = None, link: str = "", folder: Path = Path()) -> str:
+    """The page as text; `link`: to the page of the blind check, from where this one lies; `folder`: of the result."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
 
@@ -38,7 +38,7 @@ def render(d: Diagnosis, missed: Any = None, link: str = "") -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["embed"] = embed
+    environment.filters |= {"embed": embed, "page": page}
     return environment.get_template(TEMPLATE).render(
         plotly=Markup(get_plotlyjs()),
         width=WIDTH,
@@ -46,7 +46,7 @@ def render(d: Diagnosis, missed: Any = None, link: str = "") -> str:
         stage_names=STAGES,
         stage_colours=STAGE,
         verdict=d.verdict,
-        top=sections.top(d),
+        top=sections.top(d, folder),
         about=sections.about(d),
         gap=sections.how_far(d),
         effects=sections.effects(d),

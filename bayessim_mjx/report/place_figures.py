@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayessim_mjx.monitor.style import BLUE
+from bayessim_mjx.quantities import finite, unit
 from bayessim_mjx.report.look import (
     DASH,
     FAINT,
@@ -19,7 +20,6 @@ from bayessim_mjx.report.look import (
     panel,
     text,
 )
-from bayessim_mjx.report.words import finite, unit
 
 MAPS_PER_ROW = 3
 

@@ -3,7 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from bayessim_mjx.diagnosis.phrases.effects import label_title
 from bayessim_mjx.monitor.style import SKY
+from bayessim_mjx.quantities import finite, unit
 from bayessim_mjx.report.look import (
     COLUMN,
     FAINT,
@@ -21,7 +23,7 @@ from bayessim_mjx.report.look import (
     panel,
     text,
 )
-from bayessim_mjx.report.words import finite, label_title, percent, unit
+from bayessim_mjx.report.words import percent
 
 MOST_LABELS = 36
 

@@ -1,10 +1,15 @@
-"""What each section of the page shows: plain dicts for the template, empty where the diagnosis has nothing to show."""
+"""The sections of the page: plain dicts for the template, empty where the diagnosis has nothing to show."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from bayessim_mjx.diagnosis.gap import of_one
+from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
+from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, label_title, titled
+from bayessim_mjx.diagnosis.phrases.verdict import number as noise_sd
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
-from bayessim_mjx.quantities import count
+from bayessim_mjx.quantities import count, finite
 from bayessim_mjx.report import gap_figures, marks, place_figures
 from bayessim_mjx.report.choice import choice
 from bayessim_mjx.report.look import STAGE
@@ -12,15 +17,9 @@ from bayessim_mjx.report.words import (
     MISSING,
     STAGES,
     between,
-    candidate_title,
     closure,
-    effect_line,
-    effect_title,
     estimate,
-    finite,
     gap_closed,
-    headline,
-    label_title,
     length,
     number,
     percent,
@@ -29,54 +28,46 @@ from bayessim_mjx.report.words import (
     spanned,
     stages_of,
     stages_told,
-    verdict_of,
 )
 
-MOST_CANDIDATES = 20
-MOST_SENTENCES = 10  # that are not folded away: the most important come first
+MOST_CANDIDATES = 20  # in the table; no source: a matter of style
+OPEN_WARNINGS = 3  # more are folded away; no source: a matter of style
 TILES = {
-    "nominal": "gap as delivered",
-    "calibrated": "after recalibrating",
+    "nominal": "as delivered",
+    "calibrated": "after recalibration",
     "with_effects": "with the effects",
-    "reducible_floor": "what repeats differ by",
 }
 
 
-def top(d: Diagnosis) -> dict[str, Any]:
-    """Verdict, sentences, what to do next and the key numbers."""
-    verdict, stages, said = verdict_of(d), stages_of(d), d.sentences[1:]
+def top(d: Diagnosis, folder: Path) -> dict[str, Any]:
+    """The first screen: verdict, effects with places and numbers, three gaps, a command, warnings."""
+    verdict, stages = verdict_of(d), stages_of(d)
     shown = [s for s in TILES if s in stages_told(d) and finite(stages[s])]
-    tiles = [{"words": TILES[s], "colour": STAGE[s], **_tile(d, s)} for s in shown]
-    closed = gap_closed(stages)
-    if finite(closed):
-        words = f"of the squared gap {'that repeats' if repeated(d) else 'above the noise'} closed"
-        tiles.append({"words": words, "value": percent(closed), "unit": "", "below": "", "colour": "#1f2429"})
-    found = [{"line": effect_line(e), "rivals": len(e.equivalent_to)} for e in d.effects]
     return {
         "badge": verdict.badge,
         "verdict": d.verdict,
         "headline": headline(d),
-        "sentences": said[:MOST_SENTENCES],
-        "more": said[MOST_SENTENCES:],
+        "sentences": d.sentences[1:],
         "advice": verdict.advice,
-        "tiles": tiles,
-        "found": found,
+        "command": command(d, folder),
+        "tiles": [{"words": TILES[s], "colour": STAGE[s], **_tile(d, s)} for s in shown],
         "warnings": len(d.warnings),
+        "open": len(d.warnings) <= OPEN_WARNINGS,
     }
 
 
 def _tile(d: Diagnosis, stage: str) -> dict[str, str]:
     """A stage's gap: of one joint in its unit, of several as a share of the motion; noise sd below."""
-    noises = f"{number(getattr(d.gap, stage))} noise sd"
+    level = getattr(d.gap, stage)
+    noises = f"{noise_sd(level)} noise sd" + ", within the noise" * of_one(level**2).at_noise
     rows = [r for r in d.gap.physical.values() if finite(r.get(stage))]
     part = d.gap.shares.get(stage)
     if len(rows) == len(d.gap.physical) == 1:
         value, _, unit_ = length(rows[0][stage], rows[0]["unit"]).partition(" ")
-        parts = [f"{percent(part)} of the motion", noises] if finite(part) else [noises]
-        return {"value": value, "unit": unit_, "below": ", ".join(parts)}
+        return {"value": value, "unit": unit_, "below": noises}
     if finite(part):
-        return {"value": percent(part), "unit": "", "below": f"of the motion, {noises}"}
-    return {"value": number(getattr(d.gap, stage)), "unit": "noise sd", "below": ""}
+        return {"value": percent(part), "unit": "of the motion", "below": noises}
+    return {"value": noise_sd(level), "unit": "noise sd", "below": ""}
 
 
 def about(d: Diagnosis) -> list[str]:
@@ -191,7 +182,7 @@ def effects(d: Diagnosis) -> list[dict[str, Any]]:
 
 def _effect(e: FoundEffect) -> dict[str, Any]:
     return {
-        "title": effect_title(e.name, e.where),
+        "title": capital(titled(e.name, e.where)),
         "label": f"{e.name}@{e.where}",
         "sentence": e.sentence,
         "parameters": [dict(zip(("name", "value"), quantity(k, v), strict=True)) for k, v in e.parameters.items()],

@@ -1,31 +1,20 @@
-"""A diagnosis on the terminal: the verdict, the effects, the best candidates, the warnings and where the files are."""
+"""A diagnosis on the terminal: verdict, effects, gap, a command and warnings first; then tables and sentences."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
+from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
+from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
+from bayessim_mjx.diagnosis.phrases.verdict import gap_line
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.tables import TIE
-from bayessim_mjx.report.words import (
-    MISSING,
-    between,
-    candidate_title,
-    closure,
-    effect_title,
-    estimate,
-    finite,
-    headline,
-    not_fitted,
-    number,
-    percent,
-    quantity,
-    stages_of,
-    stages_told,
-    verdict_of,
-)
+from bayessim_mjx.quantities import finite
+from bayessim_mjx.report.words import MISSING, between, closure, estimate, not_fitted, number, percent, quantity
 
-BEST = 8
-NOT_FITTED = 6  # named for each reason; diagnosis.json has all
+BEST = 8  # candidates; no source: a matter of style
+NOT_FITTED = 6  # named for each reason; diagnosis.json has all; no source: a matter of style
 Table = tuple[list[str], list[list[str]], tuple[int, ...]]  # header, rows, columns of words
 COLOURS = {
     "no_gap": "green",
@@ -50,11 +39,15 @@ def console(
         headless: no control characters, as where there is no terminal.
     """
     with Console(file=file, headless=headless) as out:
-        out.panel(verdict_of(diagnosis).badge, _verdict(diagnosis), COLOURS[diagnosis.verdict])
-        for table in (_effects, _parameters, _places, _candidates):
-            header, rows, words = table(diagnosis)
-            if rows:
-                out.grid(header, rows, left=words)
+        out.panel(verdict_of(diagnosis).badge, _first(diagnosis), COLOURS[diagnosis.verdict])
+        if folder is not None and (text := command(diagnosis, folder)):
+            out.command("next", text)
+        for warning in diagnosis.warnings:
+            out.warning(warning)
+        _tables(out, diagnosis, (_effects, _parameters))
+        for sentence in diagnosis.sentences[1:]:
+            out.say(f"- {sentence}")
+        _tables(out, diagnosis, (_places, _candidates))
         if len(diagnosis.candidates) > BEST:
             out.say(f"{len(diagnosis.candidates) - BEST} more candidates in diagnosis.json")
         for line in not_fitted(diagnosis, NOT_FITTED):
@@ -63,40 +56,33 @@ def console(
             name, why = plan.get("name", MISSING), plan.get("why", "")
             text = why if name in why or name == "none" else f"{name}: {why}"
             out.say(f"next experiment: {text}" + (f" ({plan['file']})" if plan.get("file") else ""))
-        for warning in diagnosis.warnings:
-            out.warning(warning)
         for path in (Path(folder) / name for name in FILES) if folder is not None else ():
             if path.exists():
                 out.say(str(path))
 
 
-def _verdict(d: Diagnosis) -> list[tuple[str, str]]:
-    """Lines of (text, style)."""
-    known = [f"{stages_told(d)[s]} {number(v)}" for s, v in stages_of(d).items() if finite(v) and s in stages_told(d)]
-    lines = [(headline(d), "bold"), *((sentence, "") for sentence in d.sentences[1:])]
-    if known:
-        lines.append(("gap in noise standard deviations: " + ", ".join(known), ""))
-    lines += [(line, "") for line in _longest(d)]
-    return [*lines, (verdict_of(d).advice, "dim")]
+def _tables(out: Console, d: Diagnosis, tables: tuple[Callable[[Diagnosis], Table], ...]) -> None:
+    for table in tables:
+        header, rows, words = table(d)
+        if rows:
+            out.grid(header, rows, left=words)
 
 
-def _longest(d: Diagnosis) -> list[str]:
-    """The gap over the longest horizon, where that is not the one of the line before."""
-    last = d.gap.horizons[-1] if d.gap.horizons else {}
-    if not last or last.get("nominal") == d.gap.nominal:
-        return []
-    known = [f"{words} {number(last[s])}" for s, words in stages_told(d).items() if finite(last.get(s))]
-    return [f"{last['name']} ({number(last.get('seconds'), 2)} s): " + ", ".join(known)]
+def _first(d: Diagnosis) -> list[tuple[str, str]]:
+    """Lines of (text, style) that a person sees first; the same order as on the page."""
+    lines = [(headline(d), "bold"), (gap_line(d.gap, bool(d.effects)), ""), (verdict_of(d).advice, "dim")]
+    return [(text, style) for text, style in lines if text]
 
 
 def _effects(d: Diagnosis) -> Table:
-    header = ["effect", "parameters", "gap closed", "90 %", "predicted", "score among rivals"]
+    closed = "gap closed" if len(d.effects) == 1 else "part of the gap closed"
+    header = ["effect", "parameters", closed, "90 % interval", "predicted", "score among rivals"]
     rows = []
     for e in d.effects:
         found = [quantity(k, v) for k, v in e.parameters.items()]
         rows.append(
             [
-                effect_title(e.name, e.where),
+                capital(titled(e.name, e.where)),
                 ", ".join(f"{k} {v.replace(' ', TIE)}" for k, v in found),  # a number keeps its unit
                 percent(e.gap_closed),
                 between(*e.gap_closed_ci),
@@ -128,8 +114,9 @@ def _parameters(d: Diagnosis) -> Table:
 
 def _places(d: Diagnosis) -> Table:
     """Where the gap lies, where no effect says so."""
-    rows = [[p.channel, percent(p.share), between(*p.ci), p.region] for p in d.where if d.verdict == "unexplained"]
-    return ["where the gap lies", "share", "90 %", "region"], rows, (0, 3)
+    several = d.where if d.verdict == "unexplained" and len(d.where) > 1 else []
+    rows = [[p.channel, percent(p.share), between(*p.ci), p.region] for p in several]
+    return ["where the gap lies", "share", "90 % interval", "region"], rows, (0, 3)
 
 
 def _candidates(d: Diagnosis) -> Table:
@@ -137,4 +124,4 @@ def _candidates(d: Diagnosis) -> Table:
     for k, c in enumerate(d.candidates[:BEST], 1):
         se = number(c.get("se")) if finite(c.get("se")) else MISSING
         rows.append([f"{k} {candidate_title(c)}", number(c.get("score")), se, closure(c.get("gap_closed"))])
-    return ["candidate", "held-out score", "standard error", "gap closed"], rows, (0,)
+    return ["candidates", "held-out score (nats)", "standard error", "gap closed by the set"], rows, (0,)

@@ -1,26 +1,21 @@
-"""A diagnosis in plain English: effects, places, units, numbers with sensible digits, verdicts and what to do next."""
+"""Numbers of a diagnosis as the page and the terminal print them, and the typesetting of sentences for the page."""
 
 import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.gap import of_rms
-from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect
-from bayessim_mjx.effects.support.words import words
-from bayessim_mjx.quantities import finite, typeset, unit
+from bayessim_mjx.diagnosis.phrases.effects import label_title, measured
+from bayessim_mjx.diagnosis.phrases.effects import quantity as _quantity
+from bayessim_mjx.diagnosis.result import Diagnosis, Estimate
+from bayessim_mjx.quantities import finite, typeset
 
 MISSING = quantities.MISSING  # where there is no number
-WIDE = 1000  # an interval of a gap whose ends differ by more is not told in numbers
-
-# quantities that are easier to read as their reciprocal
-RECIPROCALS = {
-    "inverse_limit": "limit",
-    "inverse_stall": "stall effort",
-    "inverse_speed": "no-load speed",
-    "slowness": "largest rate",
-}
+WIDE = 1000  # ratio of an interval's ends, from which on it is not printed in numbers; no source: a matter of style
+# that stay with their number
+UNITS = r"(?<=\d) ± (?=[\d−])|(?<=\d) (?:N m|noise sd|N|rad|deg|mm|ms|m|s|kg|%)(?![A-Za-z])|(?<=N m) s(?![A-Za-z])"
 STAGES = {
     "nominal": "as delivered",
     "calibrated": "recalibrated",
@@ -30,84 +25,19 @@ STAGES = {
 }
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """Badge text, one sentence where the diagnosis brings none, and what to do next."""
-
-    badge: str
-    headline: str
-    advice: str
+def signs(text: Any) -> str:
+    """A sentence with `±`, minus signs and superscripts in place of ASCII."""
+    text = re.sub(r"\^(-?\d+)", lambda power: power[1].translate(quantities.SUPERSCRIPT), str(text))
+    return re.sub(r"(?<![\w.-])-(?=\d)", "−", text.replace(" +- ", " ± "))
 
 
-VERDICTS = {
-    "no_gap": Verdict(
-        "No gap",
-        "The simulator reproduces the logs as well as their noise allows.",
-        "Train on the simulator as it is. Motions unlike the logged ones are not covered: log those too.",
-    ),
-    "parameters": Verdict(
-        "Parameters only",
-        "Recalibrating what the simulator already has closes the gap, as far as these logs tell.",
-        "Take over the recalibrated parameters listed below: pass effects=effects.yaml, which holds them, to main, "
-        "train or play. These logs ask for no effect.",
-    ),
-    "noise": Verdict(
-        "Noise larger than estimated",
-        "Nothing predicts what remains, and it has the covariance of noise of the sensors.",
-        "Take over the recalibrated parameters listed below. State what the sensors are worth (sigma: in the logs' "
-        "metadata), or repair them; no effect needs to be added.",
-    ),
-    "effects": Verdict(
-        "Missing effects found",
-        "The simulator leaves out effects that these logs identify.",
-        "Pass effects=effects.yaml to main, train or play, or load model_with_effects.xml in plain MuJoCo.",
-    ),
-    "ambiguous": Verdict(
-        "Ambiguous",
-        "Several explanations fit these logs equally well.",
-        "Run the next experiment below: it separates the rivals. Until then, randomise over all of them.",
-    ),
-    "unexplained": Verdict(
-        "Unexplained",
-        "Part of the gap is reproducible, but no effect in the library explains it.",
-        "Look at where the remaining force acts, below, and give the cause as an effect of your own "
-        "(--effects file.py:Name).",
-    ),
-    "insufficient_data": Verdict(
-        "Too little data",
-        "These logs cannot tell.",
-        "Repair or extend the logs as the warnings below say, and diagnose again.",
-    ),
-}
-
-
-PARTLY = Verdict(
-    "Partly explained",
-    "The named effects leave more of the gap than is tolerated.",
-    "Pass effects=effects.yaml to main, train or play for what was found. For the rest, look at where the remaining "
-    "force acts, below, and give the cause as an effect of your own (--effects file.py:Name); or allow more with "
-    "--tolerance.",
-)
-
-
-REMAINDER = Verdict(
-    "Effects and a remainder",
-    "The named effects explain most of the gap; more than is tolerated remains.",
-    "Pass effects=effects.yaml to main, train or play. Their laws are not quite those of the real system: allow what "
-    "remains with --tolerance, or look at where the remaining force acts, below, and give a law of your own "
-    "(--effects file.py:Name).",
-)
-
-
-def verdict_of(d: Diagnosis) -> Verdict:
-    """The verdict's words; what remains beside named effects has its own."""
-    if d.verdict == "effects" and d.gap.beyond:
-        return REMAINDER
-    return PARTLY if d.verdict == "unexplained" and d.effects else VERDICTS[d.verdict]
+def page(text: Any) -> str:
+    """A sentence as it is printed on a page: with `signs`, and no line break between a number and its unit."""
+    return re.sub(UNITS, lambda tied: tied[0].replace(" ", "\N{NO-BREAK SPACE}"), signs(text))
 
 
 def stages_told(d: Diagnosis) -> dict[str, str]:
-    """The stages that are there to be told: none with effects where there are none, no floor where nothing repeats."""
+    """The stages that exist: none with effects where there are none, no floor where nothing repeats."""
     left_out = {"with_effects": not d.effects, "reducible_floor": not repeated(d)}
     return {s: words for s, words in STAGES.items() if not left_out.get(s)}
 
@@ -133,7 +63,7 @@ def known_span(span: Any) -> tuple[float, float] | None:
 
 
 def spanned(span: Any) -> str:
-    """The ends of an interval of a gap in brackets; of one that says nothing, that it is wide."""
+    """The ends of an interval of a gap in brackets; one without information is called wide."""
     span = known_span(span)
     if span is None:
         return ""
@@ -152,40 +82,14 @@ def percent(share: Any, sign: bool = False) -> str:
 
 
 def estimate(mean: Any, sd: Any = math.nan, in_unit: str = "") -> str:
-    """`0.0312 ± 0.0021 N m`, see `quantities.estimate`; seconds below 0.5 as ms."""
-    if in_unit == "s" and finite(mean) and abs(mean) < 0.5:
-        mean, sd, in_unit = 1e3 * mean, 1e3 * sd if finite(sd) else sd, "ms"
-    tail = f" {unit(in_unit)}" if in_unit else ""
-    return typeset(quantities.estimate(mean, sd)) + tail
+    """`0.0312 ± 0.0021 N m`, see `phrases.effects.measured`."""
+    return signs(measured(mean, sd, in_unit))
 
 
-def effect_noun(name: str) -> str:
-    return words(name).noun
-
-
-def effect_title(name: str, where: str) -> str:
-    """`Coulomb friction at joint 'elbow'`."""
-    title = words(name).at(where, quoted=True)
-    return title[:1].upper() + title[1:]
-
-
-def label_title(label: str, short: bool = False) -> str:
-    """`coulomb_friction@elbow` -> `Coulomb friction at joint 'elbow'`, or in short `Coulomb friction · elbow`."""
-    name, _, where = str(label).partition("@")
-    if short and where:
-        title = effect_noun(name)
-        return f"{title[:1].upper()}{title[1:]} · {where}"
-    return effect_title(name, where) if where or words(name).kind else str(label)
-
-
-def candidate_title(candidate: Mapping[str, Any]) -> str:
-    """`Coulomb friction · elbow, wrist + Command delay · motor`: each law once, with its places."""
-    places: dict[str, list[str]] = {}
-    for label in candidate.get("effects") or []:
-        law, _, place = label_title(label, short=True).partition(" · ")
-        places.setdefault(law, []).append(place)
-    titles = [" · ".join(filter(None, (law, ", ".join(filter(None, at))))) for law, at in places.items()]
-    return " + ".join(titles) or str(candidate.get("label") or "no effect")
+def quantity(name: str, value: Estimate) -> tuple[str, str]:
+    """A parameter's name and value, see `phrases.effects.quantity`."""
+    title, text = _quantity(name, value)
+    return title, signs(text)
 
 
 def not_fitted(d: Diagnosis, most: int | None = None) -> list[str]:
@@ -198,43 +102,10 @@ def not_fitted(d: Diagnosis, most: int | None = None) -> list[str]:
     return lines
 
 
-def quantity(name: str, value: Estimate) -> tuple[str, str]:
-    """A parameter's name and value for people; reciprocals turned over (`inverse_limit` 0.5 1/(N m) -> limit 2 N m)."""
-    if name in RECIPROCALS and finite(value.mean) and value.mean > 0:
-        sd = value.sd / value.mean**2 if finite(value.sd) else value.sd  # d(1/x) = dx / x^2
-        turned = {"at least": "at most", "at most": "at least"}.get(value.bound, value.bound)
-        return RECIPROCALS[name], _bounded(estimate(1 / value.mean, sd, _turned(value.unit)), turned)
-    return name.replace("_", " "), _bounded(estimate(value.mean, value.sd, value.unit), value.bound)
-
-
-def _bounded(text: str, bound: str) -> str:
-    """A value that ends at a bound (`Estimate.bound`)."""
-    if bound in ("at least", "at most"):
-        return f"{bound} {text}"
-    return text + {"off": " (off)", "end": " (end of its range)"}.get(bound, "")
-
-
-def _turned(text: str) -> str:
-    over, _, under = text.partition("/")
-    under = under.removeprefix("(").removesuffix(")")
-    return under if over in ("1", "") else f"{under}/{over}"
-
-
-def effect_line(effect: FoundEffect) -> str:
-    """`Coulomb friction at joint 'elbow': 0.031 ± 0.002 N m`; several parameters by name."""
-    found = [quantity(k, v) for k, v in effect.parameters.items()]
-    values = [v if len(found) == 1 else f"{k} {v}" for k, v in found]
-    return effect_title(effect.name, effect.where) + (": " + ", ".join(values) if values else "")
-
-
 def accuracy(d: Diagnosis) -> str:
     """`mass 4.9 % (90 %: 2.1 % – 12 %), damping ...`: inferred accuracies of the model's numbers; "" if stated."""
     each = [f"{k} {percent(own['median'])} (90 %: {between(own['low'], own['high'])})" for k, own in d.accuracy.items()]
     return ", ".join(each)
-
-
-def headline(diagnosis: Diagnosis) -> str:
-    return diagnosis.sentences[0] if diagnosis.sentences else verdict_of(diagnosis).headline
 
 
 def gap_closed(stages: Mapping[str, Any]) -> float:

@@ -162,7 +162,7 @@ def published(data: Path) -> None:
 
     from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check
     from bayessim_mjx.diagnosis.fitting import robot
-    from bayessim_mjx.diagnosis.summary import first_look
+    from bayessim_mjx.diagnosis.phrases import first_look
     from bayessim_mjx.logs import read_logs
 
     for name, convert in (("EMPS", real_logs.convert_emps), ("XL330", real_logs.convert_xl330)):

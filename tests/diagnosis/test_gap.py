@@ -1,13 +1,10 @@
 """The gap by hand: the share that is closed, the residual share, and the noise."""
 
 import math
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.gap import AT_NOISE, Gap, of_one, of_rms
-from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
 
 
 @pytest.mark.parametrize(
@@ -49,19 +46,3 @@ def test_noise_is_told_by_what_is_left_in_noise_standard_deviations():
     assert of_rms(50.0, AT_NOISE).at_noise and of_rms(50.0, 0.7).at_noise
     assert not of_rms(50.0, 1.01 * AT_NOISE).at_noise
     assert of_one(100 * 1.14**2, 100.0).at_noise and not of_one(100 * 1.16**2, 100.0).at_noise  # sums over windows
-
-
-def test_what_a_flexible_force_removes_is_a_share_of_what_is_above_the_noise():
-    """Windows of 50 residuals: 5 noise variances of which 3 go are three quarters of 4; 1.3 of them are the noise."""
-
-    def held(variances, gain):
-        return SimpleNamespace(significant=True, base=np.full(8, 50.0 * variances), gain=8 * 50.0 * gain)
-
-    depends = [{"input": "the speed of elbow", "importance": 1.0}]
-    found = SimpleNamespace(condition=held(5.0, 3.0), samples=50, where={"elbow": 1.0}, depends_on=depends)
-    found.interpolation = held(1.3, 0.2)
-    first, second = flexible_in_words(found)
-    assert first.endswith("other operating conditions a flexible force removes 75 % of the squared gap that is left")
-    assert second == "what is missing acts at elbow and depends on the speed of elbow"
-    found.condition = held(1.3, 0.2)
-    assert flexible_in_words(found)[0].startswith("what is left lies within the measurement noise")

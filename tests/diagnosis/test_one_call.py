@@ -124,9 +124,9 @@ def test_out_writes_what_the_command_writes(more, tmp_path, monkeypatch, capsys)
 
 
 def test_verdicts_have_words_that_the_report_has_too():
-    from bayessim_mjx.report import words
+    from bayessim_mjx.diagnosis.phrases import advice
 
-    assert [v.words for v in diagnosis.Verdict] == [words.VERDICTS[v].badge for v in diagnosis.Verdict]
+    assert [v.words for v in diagnosis.Verdict] == [advice.VERDICTS[v].badge for v in diagnosis.Verdict]
     page = (Path(__file__).parents[2] / "docs" / "diagnosis.md").read_text().lower()
     assert [v.words for v in diagnosis.Verdict if v.words.lower() not in page] == []
     assert diagnosis.Verdict("effects") == "effects" == f"{fake.full().verdict}"

@@ -6,8 +6,9 @@ import itertools
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis import phrases, run
+from bayessim_mjx.diagnosis import run
 from bayessim_mjx.diagnosis.evidence import selecting
+from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection import successive_halving
 from bayessim_mjx.diagnosis.selection.budget import Budget

@@ -9,8 +9,8 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 import fake  # noqa: E402
 
+from bayessim_mjx.diagnosis.phrases import residual
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes, Term
-from bayessim_mjx.diagnosis.summary.left_in_words import black_boxes_in_words, formula_in_words
 from bayessim_mjx.report import evidence
 
 TERMS = (Term("elbow", "sign w", -0.0613), Term("elbow", "1", 0.2), Term("wrist", "u of elbow", 0.5))
@@ -27,12 +27,12 @@ def test_the_table_has_shares_and_the_formula():
 
 @pytest.mark.parametrize(("named", "end"), [(0.931, ", the named effects 93 %."), (float("nan"), ".")])
 def test_one_sentence(named, end):
-    (told,) = black_boxes_in_words(BlackBoxes(0.874, -0.1, named, TERMS[:1], 4))
-    head = "On conditions held out a small network that knows nothing of physics closes 87 % of the squared gap"
-    assert told == f"{head}, a formula of 1 term nothing{end}"
-    assert black_boxes_in_words(None) == []
+    (told,) = residual.black_boxes(BlackBoxes(0.874, -0.1, named, TERMS[:1], 4))
+    head = "Shares of the squared gap that are closed on held-out conditions: a small network without physics 87 %"
+    assert told == f"{head}, a formula of 1 term none{end}"
+    assert residual.black_boxes(None) == []
 
 
 def test_the_formula_in_words():
-    words = formula_in_words(BlackBoxes(0.0, 0.0, 0.0, TERMS, 4))
+    words = residual.formula(BlackBoxes(0.0, 0.0, 0.0, TERMS, 4))
     assert words == ["elbow: -0.0613 sign w + 0.2", "wrist: 0.5 u of elbow"]

@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from bayessim_mjx.diagnosis.phrases import advice, effects
 from bayessim_mjx.diagnosis.result import VERDICTS, Estimate, FoundEffect
 from bayessim_mjx.report import words
 
@@ -52,36 +53,36 @@ def test_shares(share, text):
 
 
 def test_units_have_superscripts():
-    assert words.unit("N m s^2/rad^2") == "N m s²/rad²" and words.unit("N m/rad^3") == "N m/rad³"
+    assert words.signs("N m s^2/rad^2") == "N m s²/rad²" and words.signs("N m/rad^3") == "N m/rad³"
 
 
 def test_effects_in_plain_english():
-    assert words.effect_title("payload", "hand") == "Extra payload at body 'hand'"
-    assert words.effect_title("coulomb_friction", "all") == "Coulomb friction at all joints"
-    assert words.effect_title("payload", "all") == "Extra payload at all bodies"
-    assert words.effect_title("my_effect", "elbow") == "My effect at 'elbow'"
-    assert words.label_title("actuator_delay@m1", short=True) == "Command delay · m1"
+    assert effects.label_title("payload@hand") == "Extra payload at hand"
+    assert effects.label_title("coulomb_friction@all") == "Coulomb friction at all joints"
+    assert effects.label_title("payload@all") == "Extra payload at all bodies"
+    assert effects.label_title("my_effect@elbow") == "My effect at elbow"
+    assert effects.label_title("actuator_delay@m1", short=True) == "Command delay · m1"
 
 
 def test_a_law_at_several_places_is_named_once():
     labels = ["coulomb_friction@elbow", "coulomb_friction@wrist", "actuator_delay@m1", "cogging@all"]
     assert (
-        words.candidate_title({"effects": labels})
+        effects.candidate_title({"effects": labels})
         == "Coulomb friction · elbow, wrist + Command delay · m1 + Cogging · all"
     )
-    assert words.candidate_title({"effects": [], "label": "base"}) == "base"
+    assert effects.candidate_title({"effects": [], "label": "base"}) == "base"
 
 
 def test_a_reciprocal_is_turned_over_with_its_error():
     # 1 / 0.5 = 2, sd 0.05 / 0.5^2 = 0.2
-    assert words.quantity("inverse_limit", Estimate(0.5, 0.05, "1/(N m)")) == ("limit", "2.00 ± 0.20 N m")
-    assert words.quantity("inverse_speed", Estimate(0.1, 0.01, "s/rad")) == ("no-load speed", "10.0 ± 1.0 rad/s")
+    assert effects.quantity("inverse_limit", Estimate(0.5, 0.05, "1/(N m)")) == ("limit", "2.00 +- 0.20 N m")
+    assert effects.quantity("inverse_speed", Estimate(0.1, 0.01, "s/rad")) == ("no-load speed", "10.0 +- 1.0 rad/s")
 
 
 def test_an_effect_with_several_parameters_names_them():
     two = {"level": Estimate(0.1, 0.03, "N m"), "excess": Estimate(0.2, 0.05, "N m")}
-    line = words.effect_line(FoundEffect("stribeck_friction", "j", two, 1.0, 0.5, (0.4, 0.6)))
-    assert line == "Stribeck friction at joint 'j': level 0.100 ± 0.030 N m, excess 0.200 ± 0.050 N m"
+    line = effects.line(FoundEffect("stribeck_friction", "j", two, 1.0, 0.5, (0.4, 0.6)))
+    assert line == "Stribeck friction at j: level 0.100 +- 0.030 N m, excess 0.200 +- 0.050 N m"
 
 
 def test_gap_closed_by_hand():
@@ -91,7 +92,7 @@ def test_gap_closed_by_hand():
 
 
 def test_every_verdict_has_words():
-    assert set(words.VERDICTS) == set(VERDICTS)
+    assert set(advice.VERDICTS) == set(VERDICTS)
 
 
 @pytest.mark.parametrize(
@@ -112,3 +113,16 @@ def test_the_ends_of_an_interval_of_shares_never_look_the_same():
     assert words.between(0.96, 0.999) == "96 % – 99.9 %"
     assert words.between(0.99963, 1.0) == "99.963 % – 100.000 %"
     assert words.between(float("nan"), 1.0) == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "printed"),
+    [
+        ("0.15 +- 0.01 N m at hinge", "0.15_±_0.01_N_m at hinge"),
+        ("-0.5 N m s^2/rad^2 on run-1 of 2026-11-29", "−0.5_N_m_s²/rad² on run-1 of 2026-11-29"),
+        ("99 % of it, 2.69 noise sd", "99_% of it, 2.69_noise_sd"),
+        ("--accuracy 5% at wrist2 mass", "--accuracy 5% at wrist2 mass"),
+    ],
+)
+def test_a_sentence_is_typeset_for_the_page(text, printed):
+    assert words.page(text).replace("\N{NO-BREAK SPACE}", "_") == printed

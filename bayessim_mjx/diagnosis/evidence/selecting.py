@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.evidence import masked_effects
 from bayessim_mjx.diagnosis.evidence.laws import compatible, special_cases
 from bayessim_mjx.diagnosis.evidence.search import Search
@@ -20,6 +19,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate, solve
 from bayessim_mjx.diagnosis.gap import Gap
+from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
 from bayessim_mjx.diagnosis.selection.fits import begin, cut_back
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model

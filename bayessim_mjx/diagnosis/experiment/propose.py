@@ -12,13 +12,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.experiment.design import Scored, Scorer
 from bayessim_mjx.diagnosis.experiment.excitation import Excitation, Room, menu
 from bayessim_mjx.diagnosis.experiment.limits import Drives, Limits, limits_of
 from bayessim_mjx.diagnosis.experiment.rehearsal import Played, Rehearsal
 from bayessim_mjx.diagnosis.findings import Findings
+from bayessim_mjx.diagnosis.phrases import experiment as phrases
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model, nats
 from bayessim_mjx.diagnosis.selection.search_state import ranked
@@ -317,4 +317,4 @@ def reason(scorer: Scorer, chosen: Scored | None, labels: Sequence[str], contest
         return phrases.sharpens(action, *change) if useful else phrases.sharpens_little(chosen.name, *change)
     if not useful:
         return phrases.separates_nobody(labels, chosen.name, chosen.evidence, instead(scorer.models))
-    return phrases.tells_apart(action, labels, chosen.evidence, contested)
+    return phrases.tells_apart(action, labels, chosen.evidence, contested, BUDGET.mild)

@@ -3,44 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from bayessim_mjx import versions
-from bayessim_mjx.diagnosis import phrases, statistics
+from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Where
+from bayessim_mjx.diagnosis.phrases import effects as phrases
+from bayessim_mjx.diagnosis.phrases import first_look, residual
+from bayessim_mjx.diagnosis.phrases.verdict import horizon_warning, sentences
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap, Place
 from bayessim_mjx.diagnosis.selection import bounds
 from bayessim_mjx.diagnosis.selection.budget import SINGLES
-from bayessim_mjx.diagnosis.selection.models import systematic
+from bayessim_mjx.diagnosis.selection.models import BASE, systematic
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, ranked
-from bayessim_mjx.diagnosis.summary import effects_found, first_look, how_far, known_parameters
+from bayessim_mjx.diagnosis.summary import effects_found, how_far, known_parameters
 from bayessim_mjx.diagnosis.summary.finer_steps import AtFinerSteps
-from bayessim_mjx.diagnosis.summary.left_in_words import (
-    black_boxes_in_words,
-    flexible_in_words,
-    formula_in_words,
-    located_in_words,
-    not_on_offer,
-    places_of,
-    spectra_in_words,
-)
-from bayessim_mjx.diagnosis.summary.sentences import horizon_warning, sentences
-from bayessim_mjx.diagnosis.summary.verdict import verdict_of
+from bayessim_mjx.diagnosis.summary.verdict import Verdict, verdict_of
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
 from bayessim_mjx.logs.log import Channels
 
-TOLD = 0.25  # of the time, from which on a sentence says that this was gone before the search
 PACKAGES = ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")  # what the result depends on
 
 
 def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: str = "") -> Diagnosis:
-    """The result of what was found.
+    """The result of what was found: numbers first, and then the sentences that are made of them.
 
     Args:
         about: what was diagnosed, see `Diagnosis`; file: name of the proposal's command file, where there is one.
@@ -59,34 +52,59 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
     verdict = verdict_of(found, far)
     known = own.mean[:base] + (finer.shift[:base] if finer else 0.0)
-    parameters = known_parameters.parameters(selection, model, sd, known)
     over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
-    texts = sentences(verdict, effects, parameters, found, far)
-    texts += [not_on_offer(e.name for e in setup.physics.effects)] if verdict.name == "unexplained" else []
     notes = [*setup.warnings, *steps, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
     more = {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
-    lies = [*located_in_words(where.found), *spectra_in_words(where.spectra)] if where else []
-    rivals = black_boxes_in_words(found.part(BlackBoxes), setup.fitter.simulator.windows.blocks)
-    return Diagnosis(
+    more |= {"experiments": proposal.details()} if proposal else {}
+    experiment = proposal.to_dict(file) if proposal else {}
+    result = Diagnosis(
         verdict=verdict.name,
-        sentences=[*filter(None, [*texts, not_tried(selection.state)]), *rivals, *lies],
+        sentences=[],
         effects=effects,
-        where=places_of(where.found) if where and where.found.spots else _where(found),
+        where=residual.places(where.found) if where and where.found.spots else _where(found),
         gap=far,
-        parameters=parameters,
+        parameters=known_parameters.parameters(selection, model, sd, known),
         candidates=ranking(selection.state),
         warnings=[*notes, *known_parameters.less_accurate(model, own.sheet), *found.warnings],
-        next_experiment=proposal.to_dict(file) if proposal else {},
+        next_experiment=experiment,
         versions=versions.of(PACKAGES),
-        details=details(found, effects, closed) | more | ({"experiments": proposal.details()} if proposal else {}),
+        details=details(found, effects, closed) | more,
         covariance={"names": list(model.fit.names), "matrix": together},
         not_fitted=not_fitted(selection.state),
         about={**about, "conditions": setup.fitter.simulator.windows.conditions} if about else {},
         hidden=list(selection.hidden),
         accuracy=known_parameters.accuracy(model, own.sheet),
         evidence=selection.weighed.to_dicts(),
+        answers=effects_found.answers(effects, experiment),
+        basis=basis(found, verdict),
     )
+    rivals = residual.black_boxes(found.part(BlackBoxes), setup.fitter.simulator.windows.blocks)
+    lies = [*residual.located(where.found), *residual.spectra(where.spectra)] if where else []
+    return replace(result, sentences=[*sentences(result), *rivals, *lies])
+
+
+def basis(found: Findings, verdict: Verdict) -> dict[str, Any]:
+    """The numbers behind the sentences that stand nowhere else in the result, see `Diagnosis.basis`."""
+    state, cut, weighed = found.selection.state, found.setup.fitter.simulator.windows, found.selection.weighed
+    window = cut.steps * cut.dt
+    top, rivals = found.flexible_winner, sum(weighed.weight[k] for k in weighed.beside)
+    chance = {"answer": weighed.weight[weighed.answer], "rivals": rivals, "nothing": weighed.weight[BASE]}
+    on = "effects" if found.model.effects else "recalibrated"
+    return {
+        "window": window,
+        "remains": verdict.remains,
+        "beaten": verdict.beaten,
+        "noise_memory": verdict.noise.memory * window if verdict.noise is not None else None,
+        "far_off": verdict.bent,
+        "builds_up": verdict.builds_up,
+        "above_noise": state.above_noise(state.base),
+        "probability": chance if weighed.answer else {},
+        "flexible": residual.flexible_of(top, on) if top is not None else {},
+        "efforts": first_look.verdict(found.setup.look),
+        "tried": sorted({e.name for e in found.setup.physics.effects}),
+        "not_tried": not_tried(state),
+    }
 
 
 def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
@@ -171,17 +189,12 @@ def not_fitted(state: SearchState) -> dict[str, list[str]]:
     return out
 
 
-def not_tried(state: SearchState) -> str:
-    """What the time was too short for, in words; "" where nothing was left out."""
+def not_tried(state: SearchState) -> dict[str, Any]:
+    """Parts of the search that the time was too short for, with the minutes that there were; {} if none."""
     parts = [f"{count} models ({part})" for part, count in state.skipped.items() if part != SINGLES]
-    if state.cut_short:
-        parts.insert(0, f"{len(state.cut_short)} single effects")
-    if not parts:
-        return ""
+    parts = [f"{len(state.cut_short)} single effects", *parts] if state.cut_short else parts
     budget = state.settings.budget
-    text = f"In {budget.seconds / 60:.3g} minutes not everything was tried: no time was left for {' and '.join(parts)}."
-    first = f" Before the search, looking at the logs and compiling took {budget.fixed / 60:.2g} of them."
-    return text + first * (budget.fixed > TOLD * budget.seconds)
+    return {"minutes": budget.seconds / 60, "before": budget.fixed / 60, "parts": parts} if parts else {}
 
 
 def _reason(state: SearchState, label: str, gains: dict[str, float]) -> str:
@@ -194,7 +207,7 @@ def _reason(state: SearchState, label: str, gains: dict[str, float]) -> str:
     return phrases.LESS_PROMISING if state.above_noise(state.base) else phrases.NOTHING_LEFT
 
 
-MANY = 24  # candidates in the isolability matrix, overlays in the report
+MANY = 24  # candidates in the isolability matrix, overlays in the report: a page of a few MB; a rule of thumb
 
 
 def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any]) -> dict[str, Any]:
@@ -244,7 +257,7 @@ def _flexible(found: Findings) -> dict[str, Any]:
     """The flexible force on the recalibrated simulator and on top of the effects, in noise standard deviations."""
     base = found.flexible_base
     winner = found.flexible_winner if found.model.effects else None
-    shown = winner or base
+    shown, on = winner or base, "effects" if winner else "recalibrated"
     if shown is None:
         return {}
     size = found.setup.fitter.size
@@ -252,7 +265,7 @@ def _flexible(found: Findings) -> dict[str, Any]:
     seeds = np.sqrt(np.maximum(shown.condition.totals.min(1), 0.0) / shown.force.shape[0])
     return {
         "depends_on": [{"input": d["input"], "importance": d["importance"]} for d in shown.depends_on],
-        "where": flexible_in_words(shown, found.setup.fitter.simulator.windows.blocks),
+        "where": residual.flexible(residual.flexible_of(shown, on), found.setup.fitter.simulator.windows.blocks),
         "seeds": [s / np.sqrt(size) for s in seeds.tolist()],
         "rms_on_base": levels[0],
         "rms_on_winner": levels[1],
@@ -265,7 +278,7 @@ def _black_boxes(found: BlackBoxes | None) -> dict[str, Any]:
         return {}
     terms = [{"joint": t.joint, "term": t.what, "force": t.force} for t in found.terms]
     shares = {"network": found.network, "formula": found.formula, "named_effects": found.named}
-    return shares | {"terms": terms, "formula_in_words": formula_in_words(found), "folds": found.folds}
+    return shares | {"terms": terms, "formula_in_words": residual.formula(found), "folds": found.folds}
 
 
 def _overlays(found: Findings) -> list[dict[str, Any]]:

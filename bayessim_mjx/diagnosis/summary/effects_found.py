@@ -7,21 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis import phrases, statistics
+from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.evidence.selecting import Rival
 from bayessim_mjx.diagnosis.evidence.weighing import Size, size_of
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
+from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.selection import bounds, heldout
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
 
 # operating conditions, from which on closure is quoted of conditions that the choice was made without: without one of
-# two, a single one is left to choose by, which tells no standard error over conditions
+# two, a single one is left to choose by, which has no standard error over conditions (n - 1 = 0 degrees of freedom);
+# source: Student's t
 LEAST = 3
-UNKNOWN = 0.5  # of its range, a standard deviation from which on logs tell nothing of a parameter
-UNTOLD = "is told by nothing in these logs"
+UNKNOWN = 0.5  # of its range: a larger standard deviation than a uniform prior's, .29, says nothing; a rule of thumb
 
 
 def effects_of(found: Findings, sd: np.ndarray, closed: dict[str, Any]) -> list[FoundEffect]:
@@ -29,6 +30,26 @@ def effects_of(found: Findings, sd: np.ndarray, closed: dict[str, Any]) -> list[
     parts = _parts(found, closed)
     out = [_effect(found, e, sd, parts[e.label]) for e in found.model.effects]
     return sorted(out, key=lambda e: -e.gap_closed)
+
+
+def answers(effects: list[FoundEffect], experiment: dict[str, Any]) -> list[dict[str, Any]]:
+    """One answer for each effect: the explanations that these logs do not separate, with a number that all share.
+
+    Args:
+        experiment: the proposal (`Experiment.to_dict`).
+
+    Returns:
+        See `Diagnosis.answers`.
+    """
+    out = []
+    for e in effects:
+        label = f"{e.name}@{e.where}"
+        rivals = [r for r in e.equivalent_to if "weight" in r]  # without one it contains the effect as a special case
+        own = {"effects": [label], "probability": e.weight_among_rivals if rivals else 1.0}
+        members = [own, *({"effects": r["effects"], "probability": r["weight"]} for r in rivals)]
+        splits = experiment["name"] if rivals and experiment.get("file") else ""
+        out.append({"effect": label, "members": members, "number": e.shared, "splits": splits})
+    return out
 
 
 @dataclass(frozen=True)
@@ -107,7 +128,7 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
         bound = bounds.of(setup.physics, c, value)
         deviation = float(sd[i]) if bound is None or bound.kind == "off" else float("nan")
         numbers[word] = Estimate(value, deviation, _unit(setup, effect, c.unit), bound.kind if bound else "")
-        clause = _bound(bound, c.unit) if bound else UNTOLD if deviation > UNKNOWN * (c.high - c.low) else ""
+        clause = _bound(bound, c.unit) if bound else phrases.UNKNOWN if deviation > UNKNOWN * (c.high - c.low) else ""
         ends += [f"{word.replace('_', ' ')} {clause}"] if clause else []
     shared = _shared(effect, size_of(effect, model.fit.values[own], sd[own]), weighed, weights)
     return FoundEffect(
@@ -154,8 +175,7 @@ def _shared(effect: Candidate, own: Size, rivals: list[Rival], weights: list[flo
 
 
 def _sentence(clauses: list[str]) -> str:
-    text = "; ".join(clauses)
-    return f"{text[:1].upper()}{text[1:]}." if text else ""
+    return phrases.capital("; ".join(clauses)) + "." * bool(clauses)
 
 
 def _weights(found: Findings, models: list[Model]) -> list[float]:
@@ -178,5 +198,13 @@ def _unit(setup: Setup, effect: Candidate, unit: str) -> str:
         return unit
     if joint < 0 or int(model.jnt_type[joint]) != 2:
         return unit
-    swap = {"N m/rad": "N/m", "N m s/rad": "N s/m", "N m s": "N s/m", "kg m^2": "kg", "N m": "N", "rad": "m"}
+    swap = {
+        "rad/(N m)": "m/N",
+        "N m/rad": "N/m",
+        "N m s/rad": "N s/m",
+        "N m s": "N s/m",
+        "kg m^2": "kg",
+        "N m": "N",
+        "rad": "m",
+    }
     return swap.get(unit, unit.replace("N m", "N").replace("rad", "m"))

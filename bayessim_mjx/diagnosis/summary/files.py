@@ -19,15 +19,15 @@ from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting import journal
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.gap import of_one
+from bayessim_mjx.diagnosis.phrases import first_look
 from bayessim_mjx.diagnosis.result import Diagnosis, load, plain
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.setup import Setup
-from bayessim_mjx.diagnosis.summary import assemble, first_look
+from bayessim_mjx.diagnosis.summary import assemble
 from bayessim_mjx.errors import UserError
 
 PRELIMINARY = "preliminary.json"  # results while the search goes on
-BEST = 20  # models listed there
 SEARCH = "search_so_far"  # folder of the fits
 COMMAND = "next_experiment.csv"
 
@@ -114,8 +114,7 @@ def _so_far(state: SearchState) -> dict[str, Any]:
     fit, calibrated = state.base.fit, state.gap(state.base)
     nominal, _ = state.nominal.quadratic(state.fitter.spread)
     best = [
-        {k: row[k] for k in ("label", "score", "se", "gap_closed", "parameters")}
-        for row in assemble.ranking(state)[:BEST]
+        {k: row[k] for k in ("label", "score", "se", "gap_closed", "parameters")} for row in assemble.ranking(state)
     ]
     return {
         "gap": {"nominal": of_one(float(nominal.c.sum()), calibrated.noise).rms, "calibrated": calibrated.rms},
@@ -181,7 +180,7 @@ def _notes(path: Path, e: Experiment, source: str) -> dict[str, Any]:
             "law": "u = ctrl + kp (ref - q) + kd (d ref/dt - dq/dt), clipped to the command limits; recommended",
             "kp": {log.actuators[i]: float(f"{d.kp[i]:.4g}") for i in torque},
             "kd": {log.actuators[i]: float(f"{d.kd[i]:.4g}") for i in torque},
-            "note": "Log u as ctrl, with controller law torque: the diagnosis wants what was sent.",
+            "note": "Log u as ctrl, with controller law torque: the diagnosis needs the command that was sent.",
         }
     return notes
 

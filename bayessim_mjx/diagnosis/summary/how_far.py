@@ -23,7 +23,7 @@ from bayessim_mjx.diagnosis.tolerance import Tolerance
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
-SHORT = 0.1  # s, the first horizon
+SHORT = 0.1  # s, the first horizon: a few control steps; a rule of thumb
 
 
 def measured(found: Findings, closed: dict[str, Any]) -> Gap:
@@ -124,9 +124,9 @@ def _level(level: float, ci: tuple[float, float], row: dict[str, Any], source: s
 
 @dataclass(frozen=True)
 class Limits:
-    """When runs count as repeated."""
+    """When runs count as repeated; rules of thumb."""
 
-    fewest: int = 3  # windows with a repeat: with fewer nothing is said
+    fewest: int = 3  # windows with a repeat: with fewer no floor is given
     same: float = 0.001  # of a command's range: commands that are the same
 
 

@@ -7,17 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import data_sheet, phrases
+from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.evidence.parameters import Posterior
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from bayessim_mjx.diagnosis.phrases import parameters as phrases
+from bayessim_mjx.diagnosis.phrases.effects import CLEAR
 from bayessim_mjx.diagnosis.selection.models import Model
 
 Array = NDArray[np.float64]
-# standard deviations from the data sheet from which on a parameter is reported: one normal value in 22 by chance. False
-# reports of fitted values were not counted.
-FAR = 2.0
 
 
 def parameters(selection: Selection, model: Model, sd: np.ndarray, mean: np.ndarray) -> dict[str, dict[str, Any]]:
@@ -30,6 +29,7 @@ def parameters(selection: Selection, model: Model, sd: np.ndarray, mean: np.ndar
             **_against_data_sheet(c, real[i], float(model.fit.belief()[i])),
             "mean": real[i], "simulated": float(values[i]), "sd": float(sd[i]), "nominal": c.neutral,
             "low": c.low, "high": c.high, "unit": c.unit, "structural": remarks.get(c.name, ""),
+            "at_bound": _at_bound(c, float(values[i])),
             "same_as": list(selection.stand_ins.get(c.name, ())),
         }
         for i, c in enumerate(base)
@@ -37,9 +37,9 @@ def parameters(selection: Selection, model: Model, sd: np.ndarray, mean: np.ndar
 
 
 def _against_data_sheet(c: Coordinate, value: float, precision: float) -> dict[str, Any]:
-    """The distance of a known parameter from its stated value, in words and in sd, if it is larger than `FAR`."""
+    """The distance of a known parameter from its stated value, in words and in sd, if it is larger than `CLEAR`."""
     away = abs(value - c.neutral) * precision**0.5
-    if not (c.stated and away > FAR):
+    if not (c.stated and away > CLEAR):
         return {"data_sheet": ""}
     return {"data_sheet": phrases.far_from_data_sheet(value, away), "away": away}
 
@@ -69,9 +69,8 @@ def structural(fitter: Fitter, model: Model) -> dict[str, str]:
     base = len(fitter.base)
     groups = len(model.estimates)
     for i, c in enumerate(model.fit.coordinates[:base]):
-        value, width = model.fit.values[i], c.high - c.low
-        if min(value - c.low, c.high - value) < 1e-3 * width:
-            out[c.name] = phrases.stuck(value)
+        if _at_bound(c, model.fit.values[i]):
+            out[c.name] = phrases.stuck(model.fit.values[i])
     if groups < 3:
         return out
     each, deviation = per_condition(fitter, model)
@@ -83,6 +82,10 @@ def structural(fitter: Fitter, model: Model) -> dict[str, str]:
         if p < 1e-3 and spread > 0.05 * (c.high - c.low) and c.name not in out:
             out[c.name] = phrases.moves(spread, groups, fitter.simulator.windows.blocks)
     return out
+
+
+def _at_bound(c: Coordinate, value: float) -> bool:
+    return bool(min(value - c.low, c.high - value) < 1e-3 * (c.high - c.low))
 
 
 def per_condition(fitter: Fitter, model: Model) -> tuple[Array, Array]:

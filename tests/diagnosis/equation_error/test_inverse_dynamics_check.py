@@ -10,7 +10,7 @@ import pytest
 from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check, lead, proposed
 from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import enumerate_candidates
-from bayessim_mjx.diagnosis.summary import first_look
+from bayessim_mjx.diagnosis.phrases import first_look
 from bayessim_mjx.effects import load as effect
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "benchmarks" / "diagnosis"))
@@ -50,10 +50,10 @@ def test_a_load_is_found_where_it_is(loaded):
 
 def test_motors_that_obey_and_a_heavier_mechanism_are_told_apart(loaded, weak):
     assert first_look.verdict(loaded) == (
-        "the motors do what they are told, but the mechanism is heavier or stiffer than the model"
+        "the motors follow their commands, but the mechanism is heavier or stiffer than the model"
     )
     assert first_look.verdict(weak[1]) == (
-        "the motors do not do what they are told, but the mechanism moves as the model says"
+        "the motors do not follow their commands, but the mechanism moves as the model predicts"
     )
     assert any("extra payload at tool: mass" in line for line in first_look.lines(loaded))
     assert any("elbow_motor 0.80 of it" in line for line in first_look.lines(weak[1]))

@@ -4,7 +4,7 @@ import pytest
 
 from bayessim_mjx import effects
 from bayessim_mjx.diagnosis.fitting.candidates import kinds_of
-from bayessim_mjx.diagnosis.summary.left_in_words import not_on_offer
+from bayessim_mjx.diagnosis.phrases.effects import not_on_offer
 from bayessim_mjx.errors import UserError
 
 ON_REQUEST = {"cable_tension", "ground_height", "lugre_friction"}
@@ -31,6 +31,6 @@ def test_a_pure_delay_acts_on_commands_behind_all_others():
 
 def test_what_was_not_on_offer_is_told():
     nouns = "cable tension, ground at another height and friction with presliding (LuGre)"
-    told = f"Not tried, as they were not named: {nouns}"
+    told = f"Not tried because not named: {nouns}"
     assert not_on_offer(["backlash"]) == f"{told} (--effects all,cable_tension,ground_height,lugre_friction)."
     assert not_on_offer(ON_REQUEST) == ""

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from bayessim_mjx.diagnosis.phrases.residual import flexible, flexible_of
 from bayessim_mjx.diagnosis.residual import flexible as f
-from bayessim_mjx.diagnosis.summary.left_in_words import flexible_in_words
 from tests.diagnosis.missing_forces import fitted, record
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
@@ -49,7 +49,7 @@ def test_all_seeds_and_ridges_are_reported(outside):
 def test_it_says_that_it_depends_on_the_direction_of_motion(outside):
     _, _, found = outside
     assert {d["quantity"] for d in found.depends_on[:2]} == {"direction", "speed"}
-    assert "direction of motion" in " ".join(flexible_in_words(found))
+    assert "direction of motion" in " ".join(flexible(flexible_of(found, "recalibrated")))
     assert found.where["shoulder"] == 1.0
 
 
@@ -59,7 +59,7 @@ def test_nothing_more_than_noise_where_nothing_is_missing():
         assert held.base.sum() < 1.15 * fit.r.size  # noise alone, to begin with
         assert held.cost.sum() > 0.85 * fit.r.size  # noise is not explained
         assert abs(held.gain) < 0.2 * fit.r.size
-    first, *_ = flexible_in_words(found)
+    first, *_ = flexible(flexible_of(found, "recalibrated"))
     assert "noise" in first or "nothing" in first
 
 

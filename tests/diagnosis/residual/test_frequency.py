@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bayessim_mjx.diagnosis.phrases.residual import spectra as spectra_in_words
 from bayessim_mjx.diagnosis.residual import disturbance, frequency
-from bayessim_mjx.diagnosis.summary.left_in_words import spectra_in_words
 from tests.diagnosis.missing_forces import fitted, record
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis.phrases.residual import located as located_in_words
+from bayessim_mjx.diagnosis.phrases.residual import places as places_of
 from bayessim_mjx.diagnosis.residual import disturbance, motion_inputs, regions, where
 from bayessim_mjx.diagnosis.residual.where import fingerprints
-from bayessim_mjx.diagnosis.summary.left_in_words import located_in_words, places_of
 from tests.diagnosis.missing_forces import fitted, record
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
@@ -86,7 +87,7 @@ def test_a_push_is_the_same_way_everywhere():
     found = where.locate(*case)
     places, sentences = places_of(found), located_in_words(found)
     assert places[0].region == "everywhere"
-    assert sentences[0] == "missing at shoulder, everywhere: +0.08 N m"
+    assert sentences[0] == ("Without effects, the recalibrated simulator lacks at shoulder: +0.08 N m (everywhere).")
     assert prints(case, 0)["odd and even in speed"].numbers["offset"].value == pytest.approx(0.08, rel=0.05)
 
 

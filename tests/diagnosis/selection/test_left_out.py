@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis import phrases
+from bayessim_mjx.diagnosis.phrases import effects as phrases
+from bayessim_mjx.diagnosis.phrases import verdict
 from bayessim_mjx.diagnosis.selection import fits
 from bayessim_mjx.diagnosis.selection.budget import ENDS, Budget, begun
 from bayessim_mjx.diagnosis.selection.search_state import Settings
@@ -34,10 +35,10 @@ def test_every_candidate_is_in_a_model_or_has_a_reason():
 
 
 def test_what_there_was_no_time_for_is_told_in_words():
-    assert not_tried(tried({}, [])) == ""
+    assert not_tried(tried({}, [])) == {}
     short = tried({}, [], ["a@h", "b@h"], {"single effects": 2, "2 effects": 30}, budget=Budget(120.0))
-    told = "In 2 minutes not everything was tried: no time was left for 2 single effects and 30 models (2 effects)."
-    assert not_tried(short) == told
+    told = "In 2 minutes not everything was tried: no time for 2 single effects and 30 models (2 effects)."
+    assert verdict.not_tried(not_tried(short)) == told
 
 
 def test_parts_end_one_after_the_other_and_without_a_limit_never():
@@ -59,8 +60,8 @@ def test_parts_share_what_is_left_once_the_simulator_is_compiled():
     late = Budget(100.0, 0.0, lambda: 130.0).searching()
     assert late.fixed == 100 and all(late.over(part) for part in ENDS)
     assert begun(None).searching() == begun(None)
-    told = not_tried(tried({}, [], ["a@h"], {}, budget=budget))
-    assert told.endswith("Before the search, looking at the logs and compiling took 0.67 of them.")
+    told = verdict.not_tried(not_tried(tried({}, [], ["a@h"], {}, budget=budget)))
+    assert told.endswith("Before the search, reading the logs and compiling took 0.67 of them.")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting import windows
+from bayessim_mjx.diagnosis.phrases.verdict import coasting
 from bayessim_mjx.diagnosis.result import Gap
-from bayessim_mjx.diagnosis.summary import sentences, verdict
+from bayessim_mjx.diagnosis.summary import verdict
 from bayessim_mjx.diagnosis.summary.how_far import constant_velocity_baseline
 from tests.diagnosis.pendulums import ARMATURE, DAMPING, MASS, MODEL, PERIOD, STEP, recorded
 
@@ -84,9 +85,9 @@ def test_effects_have_to_do_better_than_coasting_where_the_simulator_does_not():
 def test_a_simulator_that_is_worse_than_none_is_told():
     known = Gap(1.0, 300.0, 222.0, 26.6, 1.0, coasting=32.3)
     # 1 - (26.6^2 - 1) / (32.3^2 - 1)
-    told = sentences._coasting(known, named=True)
-    assert "32.3 noise sd off, less than the recalibrated simulator's 222; " in told
-    assert "of that squared gap the effects close 32 %" in told
-    assert "effects" not in sentences._coasting(known, named=False)
-    assert sentences._coasting(dataclasses.replace(known, coasting=250.0), named=True) == ""
-    assert sentences._coasting(dataclasses.replace(known, coasting=None), named=True) == ""
+    told = coasting(known, named=True)
+    assert "32.3 noise sd off, less than the recalibrated simulator's 222: " in told
+    assert "The effects close 32 % of the squared gap of such joints." in told
+    assert "effects" not in coasting(known, named=False)
+    assert coasting(dataclasses.replace(known, coasting=250.0), named=True) == ""
+    assert coasting(dataclasses.replace(known, coasting=None), named=True) == ""

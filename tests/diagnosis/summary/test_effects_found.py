@@ -11,9 +11,9 @@ from bayessim_mjx.diagnosis.summary import effects_found
 
 
 @pytest.mark.parametrize(
-    ("deviation", "sentence"), [(2.0, "To previous is told by nothing in these logs."), (0.9, ""), (0.001, "")]
+    ("deviation", "sentence"), [(2.0, "To previous is not identified by these logs."), (0.9, ""), (0.001, "")]
 )
-def test_a_share_that_reaches_no_joint_is_said_to_be_told_by_nothing(monkeypatch, deviation, sentence):
+def test_a_share_that_reaches_no_joint_is_said_to_be_unidentified(monkeypatch, deviation, sentence):
     """A drive at the end of a chain has one neighbour; ranges are from -1 to 1."""
     names = ("waist.effort_coupling.to_next", "waist.effort_coupling.to_previous")
     coordinates = [SimpleNamespace(name=n, low=-1.0, high=1.0, unit="", neutral=0.0) for n in names]
@@ -25,9 +25,9 @@ def test_a_share_that_reaches_no_joint_is_said_to_be_told_by_nothing(monkeypatch
     monkeypatch.setattr(effects_found.bounds, "of", lambda physics, coordinate, value: None)
     monkeypatch.setattr(effects_found, "_unit", lambda setup, effect, unit: unit)
     part = effects_found._Part(1.0, 1.0, (0.9, 1.0), 1.0)
-    told = effects_found._effect(found, effect, np.array([0.003, deviation]), part)
-    assert told.sentence == sentence
-    assert told.parameters["to_previous"].sd == deviation
+    found_ = effects_found._effect(found, effect, np.array([0.003, deviation]), part)
+    assert found_.sentence == sentence
+    assert found_.parameters["to_previous"].sd == deviation
 
 
 def test_rivals_of_one_unit_share_a_size():

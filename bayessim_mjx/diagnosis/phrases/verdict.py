@@ -1,0 +1,276 @@
+"""The verdict in sentences, from the numbers of a `Diagnosis` alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bayessim_mjx.diagnosis import tolerance
+from bayessim_mjx.diagnosis.gap import of_one, of_rms
+from bayessim_mjx.diagnosis.phrases import effects as named
+from bayessim_mjx.diagnosis.phrases import parameters, residual
+from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
+from bayessim_mjx.quantities import extent, finite, listed, percent
+
+HEADS = {
+    "no_gap": "No gap above the noise: the logs differ from the simulator by {nominal}.",
+    "parameters": "Only parameters are off: recalibration reduces the gap from {nominal} to {calibrated}.",
+    "noise": "The noise is larger than estimated: no effect and no force predicts the residual of the recalibrated "
+    "simulator, {calibrated}.",
+    "unexplained": "No effect of the library explains the gap: recalibration leaves {calibrated}.",
+}
+SMALL = " This exceeds the noise, but is too small to identify a cause."  # where the residual is above the noise
+PARTLY_HEAD = "Partly explained: {named}; more than the tolerance remains at {beyond}."
+REST = "More than the tolerance remains at {beyond}."
+IMPERFECT = "No candidate closes the rest, {rest} of the squared gap: the law is not quite that of the real system."
+NEAREST = "Nearest in the library: {nearest}."
+BEATEN = "A flexible force alone predicts held-out {held} far better than {them}."
+ON_TOP = "On top of {they}, a flexible force still closes {remains} of the recalibrated simulator's squared gap."
+FALLS = (
+    "On held-out {held} {they} {reduce} the gap from {calibrated} to {with_effects}: {shown} of the squared gap above "
+    "the noise is closed."
+)
+PROMISED = (
+    "Before any fit, one linear step predicted {predicted}. With {them} {nested} without each {one} in turn, and "
+    "with the noise of the residuals as floor, {realised} is closed."
+)
+ELSEWHERE = (
+    "If the effects are only chosen without each condition in turn, they close {elsewhere} of its gap; the fits behind "
+    "the choice had seen it, so these shares may be a little too high."
+)
+IN_SAMPLE = "These numbers are in sample: one log is one operating condition, and other conditions may differ."
+WITHIN = "Every joint is within its tolerance (closest: {within})."
+PROBABLE = (
+    "Probability of this explanation among all fitted ones: {own}; of its rivals together: {others}; of the known "
+    "parameters alone: {nothing}."
+)
+SPLITS = "To separate them, run the next experiment: {name}."
+HIDDEN = "Beside {them} these logs would not show {hidden}: numbers of {them} have the same influence on the motion."
+BUILDS_UP = (
+    "Over whole logs the error grows to {times} times the size that noise, start and parameters explain, though it "
+    "hardly shows within {window}: the law or the simulator's time step is not quite right."
+)
+BENT = (
+    "The effects need {far} of {known} known parameters far from the data sheet. Less than 1 of 10 000 robots is so by "
+    "chance, even if the data sheet is half as inaccurate again as stated. Something else may be missing, or the data "
+    "sheet is of another robot (--accuracy, --parameters)."
+)
+OF_SENSORS = "The residual has the covariance of sensor noise, {colour}."
+CHANCE = (
+    "No candidate and no flexible force predicts the residual, {calibrated}, on held-out {held}: process noise, an "
+    "input that was not logged, or noise larger than estimated."
+)
+COASTS = (
+    "Joints that keep their speed in each window, without any simulator, are {coasting} noise sd off, less than the "
+    "recalibrated simulator's {calibrated}: its forces are far off, or hardly show in such short windows.{more}"
+)
+COASTS_CLOSED = " The effects close {closed} of the squared gap of such joints."
+
+
+def sentences(d: Diagnosis) -> list[str]:
+    """The verdict, most important first; each number is one of the result's."""
+    far, basis = d.gap, d.basis
+    texts = [_head(d), *_how_far(d), *_doubts(d), coasting(far, bool(d.effects)), _probable(basis)]
+    ambiguous = [found for found in d.answers if len(found["members"]) > 1]
+    texts += [SPLITS.format(name=d.next_experiment["name"])] if any(a["splits"] for a in ambiguous) else []
+    them = "it" if len(d.effects) == 1 else "them"
+    members = {label for a in d.answers for m in a["members"] for label in m["effects"]}
+    hidden = [label for label in d.hidden if label not in members]  # a class already says that they are not separated
+    texts += [HIDDEN.format(them=them, hidden=named.any_of(hidden, named.MOST))] if hidden else []
+    texts += _noise(d)
+    if d.verdict == "unexplained" and basis.get("flexible"):
+        texts += residual.flexible(basis["flexible"], far.in_sample)
+    if basis.get("efforts"):
+        texts.append(f"By the logged efforts alone, {basis['efforts']}.")
+    texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
+    texts += parameters.remarks(d.parameters)
+    texts += [named.not_on_offer(basis["tried"])] if d.verdict == "unexplained" and basis.get("tried") else []
+    return [text for text in [*texts, not_tried(basis.get("not_tried"))] if text]
+
+
+def _head(d: Diagnosis) -> str:
+    """The first sentence: the verdict with the place and the numbers of each effect."""
+    far, fill = d.gap, _fill(d)
+    if not d.effects or d.verdict not in ("effects", "ambiguous", "unexplained"):
+        quoted = {"no_gap": far.nominal, "parameters": far.calibrated}.get(d.verdict)
+        above = quoted is not None and not of_one(quoted**2).at_noise
+        head = HEADS["no_gap"].partition(": ")[2] if above and d.verdict == "no_gap" else HEADS[d.verdict]
+        return named.capital((head + SMALL * above).format(**fill))
+    if d.verdict == "unexplained":
+        return (PARTLY_HEAD if far.beyond else HEADS["unexplained"]).format(named=named.lacking(d.effects), **fill)
+    several = {a["effect"]: a for a in d.answers if len(a["members"]) > 1}
+    open_ = [named.answer(e, several[label]) for e in d.effects if (label := f"{e.name}@{e.where}") in several]
+    sure = [e for e in d.effects if f"{e.name}@{e.where}" not in several]
+    parts = [named.capital(named.lacking(sure)) + "."] if sure else []
+    return " ".join([*parts, *open_, *([REST.format(**fill)] if far.beyond else [])])
+
+
+def _fill(d: Diagnosis) -> dict[str, str]:
+    """Numbers and forms of words that texts have places for."""
+    far, one = d.gap, len(d.effects) == 1
+    worst = _worst(far)
+    return {s: stage(far, s) for s in ("nominal", "calibrated", "with_effects")} | {
+        "them": "it" if one else "them",
+        "they": "the effect" if one else "the effects",
+        "reduce": "reduces" if one else "reduce",
+        "held": "parts of the log" if far.in_sample else "conditions",
+        "one": "part of the log" if far.in_sample else "condition",
+        "beyond": listed([_left(n, far.physical[n]) for n in worst if n in far.beyond], most=3),
+        "within": _within(far),
+        "shown": percent(of_rms(far.calibrated, far.with_effects).closed),
+        "nested": "chosen and fitted" if far.closed.get("nested") else "fitted",
+        "rest": percent(of_rms(far.calibrated, far.with_effects).left),
+        **{k: percent(far.closed.get(k)) for k in ("predicted", "realised", "elsewhere")},
+    }
+
+
+def _how_far(d: Diagnosis) -> list[str]:
+    """The gap before and after, the shares closed, and the joints against their tolerances."""
+    far, basis, out = d.gap, d.basis, []
+    left = of_rms(far.calibrated, far.with_effects).left
+    if d.effects:
+        nearest = d.verdict == "unexplained" and not far.beyond
+        out += [NEAREST.replace("{nearest}", "; ".join(map(named.line, d.effects)))] if nearest else []
+        out.append(FALLS)
+        if d.verdict == "unexplained":
+            remains = basis.get("remains") or 0.0
+            out += [ON_TOP.replace("{remains}", percent(remains))] if remains > 0 else []
+            out += [BEATEN] if basis.get("beaten") and not remains > 0 else []
+        out += [IMPERFECT] if far.beyond and d.verdict != "unexplained" and left > 0 else []
+        out += [PROMISED] if finite(far.closed.get("realised")) else []
+        out += [ELSEWHERE] if finite(far.closed.get("elsewhere")) else []
+    out += [IN_SAMPLE] if far.in_sample else []
+    if d.verdict == "unexplained" and not d.effects:
+        rest = [_left(n, far.physical[n]) for n in _worst(far) if "largest" in far.physical[n]]
+        out += [f"After recalibration these errors remain: {listed(rest[:3])}."] if rest else []
+    out += [_by_joint(far, bool(d.effects))] if len(far.physical) > 1 and d.verdict != "no_gap" else []
+    out += [WITHIN] if d.effects and _within(far) and not far.beyond else []
+    fill = _fill(d)
+    return [text.format(**fill) for text in out]
+
+
+def _doubts(d: Diagnosis) -> list[str]:
+    far_off, known = d.basis.get("far_off") or (0, 0)
+    out = [BENT.format(far=far_off, known=known)] if known else []
+    if d.basis.get("builds_up"):
+        times, window = f"{d.basis['builds_up']:.2g}", f"{d.basis['window']:.2g} s"
+        out.append(BUILDS_UP.format(times=times, window=window))
+    return out
+
+
+def _noise(d: Diagnosis) -> list[str]:
+    """Whether the residual is noise of the sensors, or chance that nothing predicts."""
+    memory, fill = d.basis.get("noise_memory"), _fill(d)
+    if memory is not None and (d.verdict == "noise" or d.gap.beyond or not of_one(d.gap.with_effects**2).at_noise):
+        return [OF_SENSORS.format(colour=f"correlated over about {1e3 * memory:.2g} ms" if memory else "white")]
+    held = (d.basis.get("flexible") or {}).get("held", {})
+    predicted = any(h["significant"] for h in held.values())
+    return [CHANCE.format(**fill)] if d.basis.get("above_noise") and not d.effects and not predicted else []
+
+
+def _probable(basis: Mapping[str, Any]) -> str:
+    chance = basis.get("probability")
+    if not chance:
+        return ""
+    nothing = percent(chance["nothing"])
+    nothing = nothing if nothing.strip("0. %") else "less than one in a million"  # by the digits of `percent`
+    return PROBABLE.format(own=percent(chance["answer"]), others=percent(chance["rivals"]), nothing=nothing)
+
+
+def coasting(far: Gap, named: bool) -> str:
+    """Where no simulator at all predicts better than the recalibrated one."""
+    if far.coasting is None or not far.coasting < far.calibrated:
+        return ""
+    closed = of_rms(far.coasting, far.with_effects).closed
+    more = COASTS_CLOSED.format(closed=percent(max(closed, 0.0))) if named and finite(closed) else ""
+    return COASTS.format(coasting=number(far.coasting), calibrated=number(far.calibrated), more=more)
+
+
+def not_tried(short: Mapping[str, Any] | None) -> str:
+    """Parts of the search that the time was too short for."""
+    if not short:
+        return ""
+    text = f"In {short['minutes']:.3g} minutes not everything was tried: no time for {listed(short['parts'])}."
+    before = f" Before the search, reading the logs and compiling took {short['before']:.2g} of them."
+    return text + before * bool(short["before"])
+
+
+def _at_bound(effect: FoundEffect) -> bool:
+    return any(v.bound not in ("", "off") for v in effect.parameters.values())
+
+
+def stage(far: Gap, name: str) -> str:
+    """`1.2 deg (2.1 % of the motion, 27.0 noise sd)`; of several joints the share alone."""
+    parts = [f"{percent(far.shares[name])} of the motion"] if name in far.shares else []
+    level = getattr(far, name)
+    within = [", within the noise"] if of_one(level**2).at_noise else [""]
+    noises = f"{number(level)} noise sd{within[0]}"
+    if len(far.physical) == 1:
+        (row,) = far.physical.values()
+        return f"{extent(row[name], row['unit'])} ({', '.join([*parts, noises])})"
+    return f"{parts[0]} ({noises})" if parts else noises
+
+
+def gap_line(far: Gap, effects: bool) -> str:
+    """The three gap numbers on one line: as delivered, recalibrated, with the effects."""
+    words = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
+    known = [s for s in words if finite(getattr(far, s)) and (effects or s != "with_effects")]
+    return "Gap: " + ", ".join(f"{stage(far, s)} {words[s]}" for s in known) + "." if known else ""
+
+
+def _worst(far: Gap) -> list[str]:
+    """Joints, the largest error against its tolerance first."""
+
+    def against(row: Mapping[str, Any]) -> float:
+        return float(row["with_effects"] / row["tolerance"]) if row.get("tolerance") else 0.0
+
+    return sorted(far.physical, key=lambda n: -against(far.physical[n]))
+
+
+def _left(name: str, row: Mapping[str, Any]) -> str:
+    """`elbow: 1.2 deg rms, 3.4 deg at most (2.1 % of its motion; tolerance 0.8 deg)`."""
+    unit = row["unit"]
+    most = f"{extent(row['with_effects'], unit)} rms, {extent(row['largest'], unit)} at most"
+    part = f"{percent(row['with_effects'] / row['motion'])} of its motion; " if row["motion"] else ""
+    return f"{name}: {most} ({part}tolerance {extent(row['tolerance'], unit)})"
+
+
+def _within(far: Gap) -> str:
+    """The joint that is closest to its tolerance."""
+    name = next((n for n in _worst(far) if far.physical[n].get("tolerance")), "")
+    if not name:
+        return ""
+    row = far.physical[name]
+    noise, unit = row.get("noise", 0.0), row["unit"]
+    above = float(tolerance.above_noise(row["with_effects"], noise))
+    return f"{name}, {extent(above, unit)} above the noise, of {extent(max(row['tolerance'], noise), unit)}"
+
+
+def _by_joint(far: Gap, effects: bool) -> str:
+    """`By joint, recalibrated and with the effects: elbow 1.2 deg, 0.05 deg; ...`, the worst first."""
+    stages = ("calibrated", "with_effects") if effects else ("nominal", "calibrated")
+    words = "recalibrated and with the effects" if effects else "as delivered and recalibrated"
+    names = _worst(far)
+    rows = [
+        f"{n} {', '.join(extent(far.physical[n][s], far.physical[n]['unit']) for s in stages)}"
+        for n in names[: named.MOST]
+    ]
+    more = f"; {len(names) - named.MOST} more in the table" if len(names) > named.MOST else ""
+    return f"By joint, {words}: {'; '.join(rows)}{more}."
+
+
+def number(value: float) -> str:
+    """Three digits, in plain notation."""
+    return f"{value:.2f}" if value < 9.995 else f"{value:.1f}" if value < 99.95 else f"{value:.0f}"
+
+
+def horizon_warning(far: Gap) -> list[str]:
+    """A share that changes with the horizon is flagged."""
+    loud = [row for row in far.horizons if not of_one(row["calibrated"] ** 2).at_noise]
+    closed = {row["name"]: of_rms(row["calibrated"], row["with_effects"]).closed for row in loud}
+    differ = len(closed) > 1 and max(closed.values()) - min(closed.values()) >= DEPENDS
+    shares = ", ".join(f"{percent(share)} ({name})" for name, share in closed.items())
+    return [f"the share of the gap that is closed depends on the horizon: {shares}"] if differ else []
+
+
+DEPENDS = 0.3  # shares closed at two horizons that differ by more are warned of; a rule of thumb

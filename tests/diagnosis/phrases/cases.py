@@ -1,0 +1,127 @@
+"""Results of every kind, made up: `python -m tests.diagnosis.phrases.cases` prints their sentences.
+
+Each exists for sentences that no other has. Numbers are chosen so that shares can be checked by hand.
+"""
+
+import dataclasses
+
+from bayessim_mjx.diagnosis.phrases import advice, parameters, verdict
+from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect, Gap
+from bayessim_mjx.diagnosis.summary.effects_found import answers
+
+ROW = {
+    "nominal": 0.0214, "calibrated": 0.0107, "with_effects": 0.000866, "unit": "rad", "tolerance": 0.02,
+    "largest": 0.004, "motion": 1.0, "noise": 0.001, "beyond": False,
+}  # fmt: skip
+SHARES = {"nominal": 0.0214, "calibrated": 0.0107, "with_effects": 0.000866}
+CLOSED = {"predicted": 0.66, "realised": 0.98, "elsewhere": 0.97, "nested": True, "ci": (0.9, 1.0)}
+ALONE = CLOSED | {"elsewhere": None, "nested": False}
+LEVEL = Gap(1.0, 21.4, 10.7, 0.866, 0.866, physical={"hinge": ROW}, shares=SHARES, closed=CLOSED)
+NO_EFFECTS = dataclasses.replace(LEVEL, with_effects=LEVEL.calibrated, closed={})
+BASIS = {"window": 0.5, "remains": 0.0, "beaten": False, "above_noise": True}
+
+
+def effect(name, where, closed=0.5, rivals=(), shared=None, **numbers):
+    """numbers: {parameter: (mean, sd, unit[, bound])}."""
+    found = {k: Estimate(*v) for k, v in numbers.items()}
+    others = [{"effects": r, "gap_closed": 0.9, "why": "", "weight": 0.2} for r in rivals]
+    own = 1.0 - 0.2 * len(others) if others else float("nan")
+    return FoundEffect(
+        name, where, found, own, closed, (closed - 0.1, closed), others, "", closed, closed, shared or {}
+    )
+
+
+FRICTION = effect("coulomb_friction", "hinge", 0.66, level=(0.1497, 0.0087, "N m"))
+GAIN = effect("actuator_gain", "torque", 0.32, gain=(0.698, 0.036, ""))
+DELAY = effect(
+    "actuator_delay", "torque", 0.98, [["actuator_lag@torque"], ["sensor_delay@hinge"]],
+    {"effects": ["actuator_delay@torque", "actuator_lag@torque"], "mean": 0.012, "low": 0.01, "high": 0.014,
+     "unit": "s", "quantities": ["delay", "time_constant"]},
+    delay=(0.012, 0.001, "s"),
+)  # fmt: skip
+PAYLOAD = effect("payload", "tool", 0.9, [["inertial_parameters@tool"]], mass=(0.99, 0.01, "kg"), com_x=(0.0, 0.1, "m"))
+END = effect("backlash", "hinge", gap=(0.05, 0.0, "rad", "at least"))
+FORCE = {
+    "on": "effects", "joints": ["hinge"], "inputs": ["hinge speed", "hinge effort"],
+    "held": {"condition": {"significant": True, "closed": 0.75, "at_noise": False},
+             "interpolation": {"significant": True, "closed": 0.8, "at_noise": False}},
+}  # fmt: skip
+NOTHING = {**FORCE, "on": "recalibrated", "held": {k: {**v, "significant": False} for k, v in FORCE["held"].items()}}
+
+
+def made(name, effects=(), far=None, experiment=None, **more):
+    """A result with its sentences; more: fields, and those of `basis`."""
+    fields = {f.name for f in dataclasses.fields(Diagnosis)}
+    basis = BASIS | {k: v for k, v in more.items() if k not in fields}
+    rest = {k: v for k, v in more.items() if k in fields}
+    far = far or (LEVEL if effects else NO_EFFECTS)
+    given = dict(where=[], parameters={}, candidates=[], warnings=[], versions={}) | rest
+    found = Diagnosis(
+        verdict=name, sentences=[], effects=list(effects), gap=far, next_experiment=experiment or {}, basis=basis,
+        answers=answers(list(effects), experiment or {}), **given,
+    )  # fmt: skip
+    return dataclasses.replace(found, sentences=verdict.sentences(found))
+
+
+def gap(far=LEVEL, rows=None, **changes):
+    """A gap with some of its numbers changed; rows: of the joints."""
+    physical = {"hinge": ROW} if rows is None else rows
+    beyond = [n for n, r in physical.items() if r["beyond"]]
+    return dataclasses.replace(far, physical=physical, beyond=beyond, **changes)
+
+
+def every():
+    """{what it shows: result}."""
+    left = {"hinge": ROW | {"with_effects": 0.03, "beyond": True}, "elbow": ROW}
+    some = gap(rows=left, with_effects=3.0)
+    quiet = {"nominal": 1.1, "calibrated": 1.0, "with_effects": 1.0}
+    loud = {"nominal": 1.4, "calibrated": 1.3, "with_effects": 1.3}
+    run = {"name": "chirp on hinge", "why": "run a chirp on hinge for 10 s", "file": "next_experiment.csv"}
+    stuck = {"mean": 0.8, "structural": parameters.stuck(0.8), "at_bound": True, "data_sheet": ""}
+    far = {"mean": 1.2, "structural": "", "at_bound": False, "away": 4.0}
+    far |= {"data_sheet": parameters.far_from_data_sheet(1.2, 4.0)}
+    moves = {"mean": 1.0, "structural": parameters.moves(0.2, 3), "at_bound": False, "data_sheet": ""}
+    same = {"mean": 1.0, "structural": "", "data_sheet": "", "same_as": ["viscous_friction@hinge"]}
+    known = {"hip": stuck, "knee": stuck, "arm": far, "leg": far, "foot": moves, "toe": same}
+    few = {"hip": stuck, "arm": far}
+    short = {"minutes": 5.0, "before": 2.0, "parts": ["3 pairs"]}
+    chance = {"answer": 0.9, "rivals": 0.08, "nothing": 1e-9}
+    return {
+        "no gap": made("no_gap", far=gap(NO_EFFECTS, **quiet), above_noise=False),
+        "a gap too small to identify": made("no_gap", far=gap(NO_EFFECTS, **loud), above_noise=False),
+        "parameters": made("parameters", far=gap(NO_EFFECTS, calibrated=1.1, with_effects=1.1), above_noise=False),
+        "parameters and a little": made("parameters", far=gap(NO_EFFECTS, calibrated=1.3, with_effects=1.3)),
+        "noise, white": made("noise", noise_memory=0.0),
+        "noise with a memory": made("noise", noise_memory=0.06),
+        "one effect": made("effects", [FRICTION], probability=chance),
+        "two effects": made("effects", [FRICTION, GAIN], hidden=["viscous_friction@hinge"]),
+        "one law at two joints": made("effects", [FRICTION, dataclasses.replace(FRICTION, where="elbow")]),
+        "one log": made("effects", [FRICTION], gap(closed=ALONE, in_sample=True)),
+        "a remainder": made("effects", [FRICTION], some),
+        "an effect at its bound": made(
+            "effects",
+            [dataclasses.replace(END, sentence="Gap ends.")],
+        ),
+        "a class with a number": made("ambiguous", [DELAY], experiment=run, probability=chance),
+        "a class without a number": made("ambiguous", [FRICTION, PAYLOAD]),
+        "unexplained": made("unexplained", flexible=FORCE | {"on": "recalibrated"}, tried=["coulomb_friction"]),
+        "unexplained by chance": made("unexplained", flexible=NOTHING, not_tried=short),
+        "partly": made("unexplained", [FRICTION], some, remains=0.2, flexible=FORCE),
+        "nearest": made("unexplained", [GAIN], gap(with_effects=6.0), beaten=True, far_off=(3, 6)),
+        "beside joints that keep their speed": made("unexplained", [GAIN], gap(with_effects=6.0, coasting=5.0)),
+        "known parameters": made("effects", [FRICTION], parameters=known, builds_up=3.0),
+        "one parameter": made("effects", [FRICTION], parameters=few, efforts="the motors follow"),
+    }  # fmt: skip
+
+
+def text():
+    """All sentences with advice, in one text."""
+    parts = []
+    for name, d in every().items():
+        said = advice.verdict_of(d)
+        parts.append("\n".join([f"# {name}", f"[{said.badge}] {said.advice}", *d.sentences]))
+    return "\n\n".join(parts) + "\n"
+
+
+if __name__ == "__main__":
+    print(text(), end="")

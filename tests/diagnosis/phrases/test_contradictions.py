@@ -1,0 +1,78 @@
+"""The reader of contradictions finds those that are planted, and none in what the room of words makes."""
+
+import json
+
+import pytest
+
+from bayessim_mjx.diagnosis.result import plain
+from tests.diagnosis.phrases import cases
+from tests.diagnosis.phrases.contradictions import contradictions
+
+EVERY = cases.every()
+
+
+def said(name):
+    """The contents of diagnosis.json."""
+    return json.loads(json.dumps(plain(EVERY[name].to_dict())))
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_no_made_up_result_contradicts_itself(name):
+    assert contradictions(said(name)) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after", "kind"),
+    [
+        ("one effect", "100 % of the squared gap above", "80 % of the squared gap above", "share"),
+        ("one effect", "predicted 66 %", "predicted 97 %", "share"),
+        ("one effect", "as floor, 98 %", "as floor, 66 %", "share"),
+        ("one effect", "fitted ones: 90 %", "fitted ones: 8.0 %", "share"),
+        ("a remainder", "closes the rest, 7.0 %", "closes the rest, 66 %", "share"),
+        ("partly", "still closes 20 %", "still closes 80 %", "share"),
+        ("partly", "force removes 75 %", "force removes 20 %", "share"),
+        ("one effect", "2.1 %", "2.3 %", None),  # is quoted nowhere
+        ("one effect", "1.1 % of the motion", "3.3 % of the motion", "source"),
+        ("one effect", "0.1497 +- 0.0087", "0.1697 +- 0.0087", "size"),
+        ("one effect", "+- 0.0087", "+- 0.0037", "size"),
+        ("one effect", "0.61 deg", "0.71 deg", "size"),
+        ("one effect", "10.7 noise sd", "12.7 noise sd", "size"),
+        ("a class with a number", "12.0 ms", "15.0 ms", "interval"),
+        ("a class with a number", "10.0 to 14.0", "11.0 to 14.0", "interval"),
+        ("a remainder", "3.00 noise sd", "3.00 noise sd, within the noise", "words"),
+        ("one effect", "The simulator lacks", "No effect of the library explains", "words"),
+        ("unexplained", "No effect of the library explains the gap", "The simulator lacks friction", "words"),
+        ("parameters", "Only parameters are off", "The simulator lacks friction", "words"),
+        ("a remainder", "More than the tolerance remains at", "Every joint is within its tolerance at", "words"),
+        ("one effect", "Every joint is within its tolerance", "More than the tolerance remains at hinge", "words"),
+        ("unexplained", "This force acts", "No candidate and no flexible force predicts it. It acts", "predicts"),
+        (
+            "unexplained by chance",
+            "A flexible force predicts nothing",
+            "A flexible force still predicts a part",
+            "predicts",
+        ),
+        ("two effects", "Beside them", "missing at hinge, moving backward: +0.41 N m.\nBeside them", "place"),
+    ],
+)
+def test_a_planted_contradiction_is_found(name, before, after, kind):
+    planted = said(name)
+    texts = "\n".join(planted["sentences"])
+    assert (before in texts) == (kind is not None)
+    planted["sentences"] = texts.replace(before, after).split("\n")
+    assert kind in {found for found, _ in contradictions(planted)} or kind is None
+
+
+def test_a_number_that_changed_under_a_sentence_is_found():
+    planted = said("one effect")
+    planted["gap"]["with_effects"] = 6.0
+    assert {"share", "verdict"} <= {found for found, _ in contradictions(planted)}
+    planted = said("a class with a number")
+    planted["effects"][0]["shared"]["mean"] = 0.02
+    assert "interval" in {found for found, _ in contradictions(planted)}
+
+
+def test_a_member_of_the_answer_that_is_called_hidden_is_found():
+    planted = said("two effects")
+    planted["hidden"] = ["coulomb_friction@hinge"]
+    assert "hidden" in {found for found, _ in contradictions(planted)}

@@ -1,0 +1,148 @@
+"""The verdict in words: numbers as they follow by hand, and no sentence against another."""
+
+import dataclasses
+import shlex
+
+import pytest
+
+from bayessim_mjx.diagnosis.phrases import advice, verdict
+from bayessim_mjx.diagnosis.result import VERDICTS, Gap
+from tests.diagnosis.phrases import cases
+from tests.diagnosis.phrases.cases import CLOSED, FRICTION, GAIN, LEVEL, PAYLOAD, gap, made
+
+
+def test_the_head_has_the_place_and_the_number_of_each_effect():
+    head = made("effects", [FRICTION, GAIN]).sentences[0]
+    assert head == (
+        "The simulator lacks Coulomb friction of 0.1497 +- 0.0087 N m at hinge; "
+        "the actuator gain at torque is 0.698 +- 0.036, not 1."
+    )
+
+
+def test_the_gap_falls_by_the_share_that_its_two_numbers_give():
+    """Of 10.7 and 3 noise sd: (114.49 - 9) / 113.49 = 92.95 %; 10.7 mrad are 0.61 deg."""
+    falls = made("effects", [FRICTION], gap(with_effects=3.0)).sentences[1]
+    assert falls.startswith("On held-out conditions the effect reduces the gap from 0.61 deg (1.1 % of the motion")
+    assert falls.endswith("93 % of the squared gap above the noise is closed.")
+
+
+def test_the_promise_and_the_result_stand_together():
+    text = made("effects", [FRICTION]).sentences[2]
+    assert "predicted 66 %" in text and "chosen and fitted without each condition" in text and "98 % is closed" in text
+    few = made("effects", [FRICTION], gap(closed=CLOSED | {"nested": False})).sentences[2]
+    assert "With it fitted without each condition" in few
+
+
+def test_of_one_log_all_numbers_are_called_in_sample():
+    one = made("effects", [FRICTION], gap(in_sample=True)).sentences
+    assert "On held-out parts of the log" in one[1] and "each part of the log" in one[2]
+    assert any(text.startswith("These numbers are in sample") for text in one)
+    assert not any("in sample" in text for text in made("effects", [FRICTION]).sentences)
+
+
+def test_a_class_is_one_answer_with_the_number_that_its_members_share():
+    found = cases.every()["a class with a number"]
+    (answer,) = found.answers
+    assert [m["effects"] for m in answer["members"]] == [
+        ["actuator_delay@torque"], ["actuator_lag@torque"], ["sensor_delay@hinge"],
+    ]  # fmt: skip
+    assert sum(m["probability"] for m in answer["members"]) == pytest.approx(1.0)
+    assert answer["splits"] == "chirp on hinge"
+    assert found.sentences[0] == (
+        "These logs fit 3 explanations alike: 12.0 ms (90 %: 10.0 to 14.0) on the command's way, by command delay or "
+        "actuator lag at torque; or, with another number, measurement delay at hinge."
+    )
+
+
+def test_an_answer_without_rivals_is_a_class_of_one():
+    (answer,) = made("effects", [FRICTION]).answers
+    assert answer["members"] == [{"effects": ["coulomb_friction@hinge"], "probability": 1.0}] and answer["splits"] == ""
+
+
+def test_a_member_of_a_class_is_not_called_hidden_as_well():
+    hidden = ["inertial_parameters@tool", "viscous_friction@hinge"]
+    text = " ".join(made("ambiguous", [PAYLOAD], hidden=hidden).sentences)
+    assert "would not show viscous friction at hinge" in text and text.count("wrong centre of mass") == 1
+
+
+def test_a_gap_within_the_noise_is_called_so():
+    assert verdict.gap_line(LEVEL, True) == (
+        "Gap: 1.2 deg (2.1 % of the motion, 21.4 noise sd) as delivered, 0.61 deg (1.1 % of the motion, 10.7 noise sd) "
+        "recalibrated, 0.050 deg (0.087 % of the motion, 0.87 noise sd, within the noise) with the effects."
+    )
+    assert "with the effects" not in verdict.gap_line(LEVEL, False)
+
+
+@pytest.mark.parametrize("name", [v for v in VERDICTS if v != "insufficient_data"])
+@pytest.mark.parametrize("effects", [[], [FRICTION], [FRICTION, GAIN]])
+def test_every_verdict_is_a_sentence(name, effects):
+    if name in ("effects", "ambiguous") and not effects:
+        return  # nothing is named so without effects
+    for text in made(name, effects, remains=0.4).sentences:
+        assert text[0].isupper() and text.endswith(".") and "{" not in text and "  " not in text
+
+
+@pytest.mark.parametrize(("nominal", "none"), [(1.14, True), (1.16, False)])
+def test_no_gap_above_the_noise_is_said_only_within_the_noise(nominal, none):
+    head = made("no_gap", far=gap(nominal=nominal, calibrated=nominal, with_effects=nominal)).sentences[0]
+    assert head.startswith("No gap above the noise") == none == ("exceeds the noise" not in head)
+    assert head.startswith("The logs differ") != none
+
+
+def test_nothing_is_said_to_predict_nothing_beside_a_force_that_predicts():
+    force = {**cases.FORCE, "on": "recalibrated"}
+    text = " ".join(made("unexplained", flexible=force).sentences)
+    assert "removes 75 %" in text and "no flexible force predicts" not in text
+    text = " ".join(made("unexplained", flexible=cases.NOTHING).sentences)
+    assert "no flexible force predicts" in text and "removes" not in text
+
+
+@pytest.mark.parametrize(("value", "text"), [(0.8661, "0.87"), (2.7, "2.70"), (21.44, "21.4"), (161.6, "162")])
+def test_numbers(value, text):
+    assert verdict.number(value) == text
+
+
+def test_a_closure_that_depends_on_the_horizon_is_flagged():
+    rows = [("0.1 s", 3.0, 1.0), ("0.5 s", 3.0, 1.1), ("whole log", 100.0, 70.0)]
+    horizons = [{"name": n, "calibrated": c, "with_effects": w} for n, c, w in rows]
+    (text,) = verdict.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons))
+    assert text.endswith("depends on the horizon: 100 % (0.1 s), 97 % (0.5 s), 51 % (whole log)")
+    assert not verdict.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons[:2]))
+
+
+ABOUT = {"model": "Pendulum", "data": ["my logs"]}
+RUN = {"name": "chirp", "file": "next_experiment.csv"}
+
+
+@pytest.mark.parametrize(
+    ("name", "effects", "about", "experiment", "words"),
+    [
+        ("effects", [FRICTION], ABOUT, {}, "bayessim-mjx train --task Pendulum effects=found/effects.yaml"),
+        ("effects", [FRICTION], ABOUT | {"model": "a/arm.xml"}, RUN,
+         "python -m mujoco.viewer --mjcf=found/model_with_effects.xml"),
+        ("no_gap", [], ABOUT, {}, "bayessim-mjx train --task Pendulum"),
+        ("ambiguous", [PAYLOAD], ABOUT | {"model": "arm.xml"}, RUN,
+         "bayessim-mjx diagnose --model arm.xml --data 'my logs' new_logs --out found_2"),
+        ("unexplained", [], ABOUT, {}, ""),
+        ("effects", [FRICTION], {}, {}, ""),
+    ],
+)  # fmt: skip
+def test_the_command_can_be_pasted(name, effects, about, experiment, words):
+    found = dataclasses.replace(made(name, effects, experiment=experiment), about=about)
+    assert advice.command(found, "found") == words == shlex.join(shlex.split(words))
+
+
+def test_too_little_data_leads_to_a_check_of_the_logs():
+    found = dataclasses.replace(made("no_gap"), verdict="insufficient_data", about=ABOUT | {"model": "arm.xml"})
+    assert advice.command(found, "found") == "bayessim-mjx logs check 'my logs' --model arm.xml"
+
+
+def test_an_experiment_is_advised_only_where_there_is_one():
+    with_one, without = (made("ambiguous", [PAYLOAD], experiment=e) for e in (RUN, {}))
+    assert "next experiment" in advice.verdict_of(with_one).advice
+    assert "next experiment" not in advice.verdict_of(without).advice
+
+
+def test_effects_within_the_tolerance_that_explain_nothing_are_no_part_of_an_explanation():
+    assert advice.verdict_of(made("unexplained", [GAIN])).badge == "Unexplained"
+    assert advice.verdict_of(cases.every()["partly"]).badge == "Partly explained"
