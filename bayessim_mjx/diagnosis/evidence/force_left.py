@@ -33,12 +33,11 @@ from bayessim_mjx.diagnosis.evidence.gaussian import (
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.selection.models import Key
-from bayessim_mjx.diagnosis.statistics import Z90
+from bayessim_mjx.diagnosis.statistics import LEVELS, Z90
 
 Array = NDArray[np.float64]
-ENDS = (0.05, 0.95)
-TURNS, GAIN = 30, 0.1  # of expectation maximisation for the noise: at most so many, while one gains so many nats
-FAR = 50.0  # of a logarithm, which is no longer told
+ENDS = ((1 - LEVELS.level) / 2, (1 + LEVELS.level) / 2)
+GAIN = 0.1  # nats by which a turn for the noise alone gains at least; odds count in whole nats
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ def force_left(windows: Windows, belief: Belief, learnt: Learnt, scale: Array) -
     sizes = np.maximum(sizes, PRIORS.spread**-2)  # the data do not make the prior less certain
     inverse = (ways / sizes) @ ways.T
     factor, sd = np.ones((2, len(free))), np.sqrt(np.diag(inverse))
-    factor[:, free] = np.exp(np.clip(sd * np.array([[-Z90], [Z90]]), -FAR, FAR))
+    factor[:, free] = np.exp(sd * np.array([[-Z90], [Z90]]))
     volume = 0.5 * float(np.sum(np.log(2 * np.pi / sizes)))
     volume += float(np.sum(log_ndtr(np.log(hyper.amplitude[free] / PRIORS.least) / sd)))  # the lower end cuts it
     for joint in np.flatnonzero(~free):
@@ -155,14 +154,13 @@ def _density(belief: Belief, there: Marginal, hyper: Hyper) -> float:
 def _without(windows: Windows, belief: Belief, hyper: Hyper) -> float:
     """The log density with no force above the least one, the noise at its best (expectation maximisation)."""
     hyper = replace(hyper, amplitude=np.full_like(hyper.amplitude, PRIORS.least))
-    value = -np.inf
-    for _ in range(TURNS):
+    last = -np.inf
+    while True:
         there = marginal(windows, hyper)
-        last, value = value, _density(belief, there, hyper)
+        value = _density(belief, there, hyper)
         if value - last < GAIN:
-            break
-        hyper = replace(hyper, noise=_noise(windows, belief, there))
-    return value
+            return max(value, last)
+        last, hyper = value, replace(hyper, noise=_noise(windows, belief, there))
 
 
 def _noise(windows: Windows, belief: Belief, there: Marginal) -> Array:
