@@ -31,7 +31,7 @@ class Limits:
             explanation. Those that leave less are, though their law may be imperfect.
     """
 
-    share: float = 0.15
+    share: float = 0.1
     # chance that known parameters of a robot lie together as far from their data sheet as the named effects leave them,
     # were it so many times as inaccurate as stated (or as the least accurate ones, `data_sheet.WORST`, where nobody
     # stated it): below that the effects explain the motion of another robot. In 63 simulated
