@@ -108,9 +108,10 @@ def force_left(windows: Windows, belief: Belief, learnt: Learnt, scale: Array) -
     for joint in np.flatnonzero(~free):
         more, factor[1, joint] = _at_the_end(slope[joint], curvature[joint, joint])
         volume, factor[0, joint] = volume + more, 0.0
-    mean, variance = forces.motion()
+    mean, variance, by_joint = forces.motion()
     rows = windows.rows * windows.gram.shape[0] * windows.gram.shape[1]
-    prior = _prior(hyper) - len(free) * np.log(PRIORS.spread * np.sqrt(2 * np.pi))
+    away = np.log(hyper.amplitude / PRIORS.usual) / PRIORS.spread
+    prior = -0.5 * np.sum(away**2) - len(free) * np.log(PRIORS.spread * np.sqrt(2 * np.pi))
     return ForceLeft(
         amplitude=hyper.amplitude * scale,
         low=factor[0] * hyper.amplitude * scale,
@@ -118,7 +119,7 @@ def force_left(windows: Windows, belief: Belief, learnt: Learnt, scale: Array) -
         nats=float(_density(belief, learnt.marginal, hyper) + prior + volume - _without(windows, belief, hyper)),
         motion=mean / rows,
         sd=float(np.sqrt(variance + shared[free] @ inverse @ shared[free])) / rows,
-        by_joint=forces.by_joint() / rows,
+        by_joint=by_joint / rows,
         noise=float(np.mean(hyper.noise**2)),
     )
 
@@ -139,11 +140,6 @@ def _at_the_end(slope: float, curvature: float) -> tuple[float, float]:
     return float(np.log(below[-1])), float(np.exp(np.interp(ENDS[1] * below[-1], below, logs)))
 
 
-def _prior(hyper: Hyper) -> float:
-    """Log prior of the amplitudes' logarithms, without its constant."""
-    return -0.5 * float(np.sum((np.log(hyper.amplitude / PRIORS.usual) / PRIORS.spread) ** 2))
-
-
 def _density(belief: Belief, there: Marginal, hyper: Hyper) -> float:
     """Log density of the data at the most probable step, with the noise's prior."""
     Q = there.Q.sum(0)
@@ -153,27 +149,19 @@ def _density(belief: Belief, there: Marginal, hyper: Hyper) -> float:
 
 def _without(windows: Windows, belief: Belief, hyper: Hyper) -> float:
     """The log density with no force above the least one, the noise at its best (expectation maximisation)."""
+    own, count, last = 1 + windows.parameters, windows.gram.shape[1], -np.inf
     hyper = replace(hyper, amplitude=np.full_like(hyper.amplitude, PRIORS.least))
-    last = -np.inf
     while True:
         there = marginal(windows, hyper)
         value = _density(belief, there, hyper)
         if value - last < GAIN:
             return max(value, last)
-        last, hyper = value, replace(hyper, noise=_noise(windows, belief, there))
-
-
-def _noise(windows: Windows, belief: Belief, there: Marginal) -> Array:
-    """`[C]`: the noise that is most likely given the expected squares of the residuals."""
-    own = 1 + windows.parameters
-    p = belief.best(there.Q.sum(0))
-    one = np.concatenate([[1.0], -p])
-    z = there.mean @ one
-    along = np.concatenate([np.tile(one, (len(z), 1)), -z @ there.root.T], 1)
-    outer = along[:, :, None] * along[:, None, :]
-    outer[:, own:, own:] += there.root @ there.cov @ there.root.T
-    left = windows.gram.reshape(len(windows.gram), -1) @ outer.ravel()
-    return np.asarray(np.sqrt(left / (windows.rows * len(z))))
+        one = np.concatenate([[1.0], -belief.best(there.Q.sum(0))])
+        along = np.concatenate([np.tile(one, (count, 1)), -there.mean @ one @ there.root.T], 1)
+        outer = along[:, :, None] * along[:, None, :]
+        outer[:, own:, own:] += there.root @ there.cov @ there.root.T
+        square = windows.gram.reshape(len(windows.gram), -1) @ outer.ravel()  # of what is left, expected
+        last, hyper = value, replace(hyper, noise=np.sqrt(square / (windows.rows * count)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,20 +196,16 @@ class _Forces:
         u = there.mean[:, :F] @ np.concatenate([[1.0], -p])
         return cls(u, there.cov[:, :F, :F], M, there.mean[:, :F, 1:], step, windows.joints)
 
-    def motion(self) -> tuple[float, float]:
-        """(mean, variance) of E given the amplitudes."""
+    def motion(self) -> tuple[float, float, Array]:
+        """(mean, variance) of E given the amplitudes, and its mean `[nv]` by the force at each joint alone."""
         MC, Mu = self.M @ self.C, (self.M @ self.u[..., None])[..., 0]
         mean = float(np.sum(self.u * Mu) + np.einsum("wii->", MC))
         variance = 2 * float(np.einsum("wij,wji->", MC, MC)) + 4 * float(np.einsum("wi,wij,wj->", Mu, self.C, Mu))
         slope = 2 * np.einsum("wi,wik->k", Mu, self.by_step)
         mean += float(np.einsum("wik,wij,wjl,kl->", self.by_step, self.M, self.by_step, self.step, optimize=True))
-        return mean, variance + float(slope @ self.step @ slope)
-
-    def by_joint(self) -> Array:
-        """`[nv]`, mean of E of the force at each joint alone."""
-        second = (self.u[:, :, None] * self.u[:, None, :] + self.C) * self.M
-        parts = second.sum(0).reshape(self.joints, second.shape[1] // self.joints, self.joints, -1)
-        return np.asarray(np.einsum("vmvn->v", parts))
+        second = np.sum((self.u[:, :, None] * self.u[:, None, :] + self.C) * self.M, axis=0)
+        parts = second.reshape(self.joints, len(second) // self.joints, self.joints, -1)
+        return mean, variance + float(slope @ self.step @ slope), np.einsum("vmvn->v", parts)
 
     def in_amplitude(self, hyper: Hyper) -> tuple[Array, Array, Array]:
         """(slope `[nv]`, minus the second derivative `[nv, nv]` of the log density in log a; that of E `[nv]`)."""

@@ -99,7 +99,8 @@ def locate(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None, *, 
 
 def _spot(node: Nodes, found: Tree | None, share: float, ci: tuple[float, float]) -> Spot:
     size = float(np.sqrt(np.mean(node.force[node.used] ** 2))) if node.used.any() else 0.0
-    leaves = _told(found) if found is not None else ()
+    every = () if found is None or found.r2 <= RULES.least_share else found.leaves
+    leaves = tuple([leaf for leaf in every if leaf.share > RULES.least_share][:3])
     along = found is not None and found.target == ALONG
     return Spot(node.joint, node.force_unit, share, ci, size, found is not None, leaves, node.units, along)
 
@@ -126,10 +127,6 @@ def _maps(nodes: list[Nodes], without: Array, rng: np.random.Generator) -> list[
     ends = np.cumsum([len(p) for _, p in made])
     parts = np.split(found, ends[:-1])
     return [m | {"significant": part.tolist()} for (m, _), part in zip(made, parts, strict=True)]
-
-
-def _told(found: Tree) -> tuple[Leaf, ...]:
-    return tuple([leaf for leaf in found.leaves if leaf.share > RULES.least_share and found.r2 > RULES.least_share][:3])
 
 
 @dataclass(frozen=True)

@@ -71,8 +71,8 @@ class Verdict:
 
 def verdict_of(found: Findings, far: Gap) -> Verdict:
     """The verdict on what was found; `far`: what remains of the gap."""
-    force, gap = found.selection.force, gap_of(found, far)
-    chance = force.chance(relevant(found, far))
+    force, (limit, gap) = found.selection.force, relevant(found, far)
+    chance = force.chance(limit)
     probable = chance > ODDS.strong / (1.0 + ODDS.strong)
     noise = sensors_noise(found) if probable else None
     missing = probable and noise is None
@@ -81,26 +81,21 @@ def verdict_of(found: Findings, far: Gap) -> Verdict:
     return Verdict(name, force.motion / gap if missing else 0.0, chance, noise, off, builds_up(found, far))
 
 
-def gap_of(found: Findings, far: Gap) -> float:
-    """The squared gap that the answer had to close, above the noise, in noise variances; at least a relevant one.
+def relevant(found: Findings, far: Gap) -> tuple[float, float]:
+    """(square that a missing force has to move to be relevant, squared gap that the answer had to close).
 
-    It is that of joints which keep their speed where these do better than the recalibrated simulator. Beside forces
-    that are far off, effects that only keep it from moving close almost all of its gap.
+    Above the noise, in noise variances of each residual. The gap is that of joints which keep their speed where these
+    do better than the recalibrated simulator: beside forces that are far off, effects that only keep it from moving
+    close almost all of its gap.
     """
     before = min(far.calibrated, math.inf if far.coasting is None else far.coasting)
-    return max(before**2 - found.selection.force.noise, RELEVANCE.noise)
-
-
-def relevant(found: Findings, far: Gap) -> float:
-    """The square that a missing force has to move to be relevant, in noise variances of each residual."""
-    if not found.model.effects:
-        return FLOOR**2 - 1.0  # of the recalibrated simulator alone less needs no explanation
-    return max(RELEVANCE.noise, LIMITS.share * gap_of(found, far))
+    gap = max(before**2 - found.selection.force.noise, RELEVANCE.noise)
+    return (max(RELEVANCE.noise, LIMITS.share * gap) if found.model.effects else FLOOR**2 - 1.0), gap
 
 
 def force_in_numbers(found: Findings, far: Gap) -> dict[str, Any]:
     """The missing force for JSON: by joint its rms in N m or N, its evidence, its share of the gap, its relevance."""
-    force, gap = found.selection.force, gap_of(found, far)
+    force, (limit, gap) = found.selection.force, relevant(found, far)
     names = Channels.of(found.setup.physics.mj_model).qvel
     rows = zip(names, force.amplitude, force.low, force.high, force.by_joint, strict=True)
     return {
@@ -108,8 +103,8 @@ def force_in_numbers(found: Findings, far: Gap) -> dict[str, Any]:
         "nats": force.nats,
         "share": force.motion / gap,
         "share_ci": [end / gap for end in force.interval()],
-        "relevant_share": relevant(found, far) / gap,
-        "chance": force.chance(relevant(found, far)),
+        "relevant_share": limit / gap,
+        "chance": force.chance(limit),
     }
 
 
