@@ -74,7 +74,7 @@ def verdict_of(found: Findings, far: Gap) -> Verdict:
     force, (limit, gap) = found.selection.force, relevant(found, far)
     chance = force.chance(limit)
     probable = chance > ODDS.strong / (1.0 + ODDS.strong)
-    noise = sensors_noise(found) if probable else None
+    noise = sensors_noise(found) if probable or force.noise > FLOOR**2 else None
     missing = probable and noise is None
     off = bent(found.model) if found.model.effects else (0, 0)
     name = "unexplained" if missing or any(off) else _explained(found, noise)
