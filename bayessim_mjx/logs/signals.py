@@ -9,10 +9,10 @@ from scipy.signal import savgol_coeffs, savgol_filter
 
 from bayessim_mjx.logs.log import Array, Channels
 
-MAX_WINDOW = 0.25  # s, the longest smoothing window
-_POLYNOMIAL = 3
+MAX_WINDOW = 0.25  # s, the longest smoothing window; rule of thumb, not measured
+_POLYNOMIAL = 3  # the least order whose derivative is exact where the acceleration grows; Savitzky and Golay 1964
 # Values that a channel has to show before its noise can be estimated: of two, nothing says whether they are one count
-# apart, so the noise may be anything.
+# apart, so the noise may be anything. Source: that count.
 LEVELS = 3
 
 
