@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit, log_ndtr
+from scipy.special import expit, log_ndtr, ndtr
 from scipy.stats import gamma
 
 from bayessim_mjx.diagnosis.evidence.gaussian import (
@@ -33,10 +33,10 @@ from bayessim_mjx.diagnosis.evidence.gaussian import (
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.selection.models import Key
-from bayessim_mjx.diagnosis.statistics import LEVELS, Z90
+from bayessim_mjx.diagnosis.statistics import Z90
 
 Array = NDArray[np.float64]
-ENDS = ((1 - LEVELS.level) / 2, (1 + LEVELS.level) / 2)
+ENDS = ndtr((-Z90, Z90))  # of a 90 % interval
 GAIN = 0.1  # nats by which a turn for the noise alone gains at least; odds count in whole nats
 
 
