@@ -37,7 +37,7 @@ from bayessim_mjx.diagnosis.statistics import Z90
 
 Array = NDArray[np.float64]
 ENDS = ndtr((-Z90, Z90))  # of a 90 % interval
-GAIN = 0.1  # nats by which a turn for the noise alone gains at least; odds count in whole nats
+GAIN = 0.1  # nats that a turn for the noise alone gains at least; odds are in whole nats; a rule of thumb
 
 
 @dataclass(frozen=True)
