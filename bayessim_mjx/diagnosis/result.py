@@ -94,13 +94,12 @@ class Diagnosis:
         answers: of each effect {"effect": label, "members": [{"effects": [label ...], "probability"}], the explanations
             that these logs do not separate, the named one first, "number": `FoundEffect.shared`, "splits": name of the
             experiment that separates them, or ""}.
-        basis: numbers behind the sentences: {"window": s, "remains": share of the recalibrated simulator's gap that a
-            flexible force closes on top of the effects, "beaten": whether it does better than they do alone,
-            "noise_memory": s of the sensors' noise, or None, "far_off": (known parameters far off, of so many),
-            "builds_up": times the likely error over whole logs, "above_noise": whether recalibration leaves more than
-            noise, "probability": {"answer", "rivals", "nothing"}, "flexible": `phrases.residual.flexible_of`,
-            "efforts": clause on the logged efforts, "tried": names of effects, "not_tried": {"minutes", "before",
-            "parts"}}.
+        basis: numbers behind the sentences: {"window": s, "remains": share of the squared gap that is made by a force
+            missing beside the effects, posterior mean (0: it is not probable that it is relevant), "noise_memory": s
+            of the sensors' noise, or None, "far_off": (known parameters far off, of so many), "builds_up": times the
+            likely error over whole logs, "above_noise": whether recalibration leaves more than noise, "probability":
+            {"answer", "rivals", "nothing"}, "flexible": `phrases.residual.flexible_of`, "efforts": clause on the
+            logged efforts, "tried": names of effects, "not_tried": {"minutes", "before", "parts"}}.
         next_experiment: {"name", "why", "evidence", "file", "table": [...]} or {}.
         details: numbers for pictures (see `report`); not part of diagnosis.json but saved beside it.
     """

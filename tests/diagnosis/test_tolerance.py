@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import tolerance
+from bayessim_mjx.diagnosis.evidence.force_left import ForceLeft
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
@@ -107,15 +108,17 @@ def said(name, effects, far):
 
 
 def findings(rms, noise=50.0, windows=8, beyond=()):
-    """A selection that names friction and leaves `rms` noises of a gap of 1000; beyond: of whole logs."""
+    """A selection that names friction and leaves a force of `rms` noises of a gap of 1000; beyond: of whole logs."""
 
     def prediction(level):
         return Prediction(np.full((windows, 5, 2), float(level)), np.zeros((windows, 4)))
 
     fit = SimpleNamespace(coordinates=(), values=())
     winner = SimpleNamespace(effects=(SimpleNamespace(coordinates=()),), total=windows * noise * rms**2, fit=fit)
+    square, one = rms**2 - 1.0, np.ones(2)
     selection = SimpleNamespace(
         ambiguous=False,
+        force=ForceLeft(one, one, one, 1e3, square, 1e-3 * square, one, 1.0),
         rivals={},
         state=SimpleNamespace(
             noise=noise,
@@ -142,9 +145,9 @@ def test_effects_that_leave_a_small_share_are_named_with_what_remains():
 
 
 def test_effects_that_leave_a_large_share_are_no_explanation():
-    """400 of 1000 noises are 16 % of the squared gap."""
-    assert verdict.verdict_of(findings(400.0), gap(0.04)).name == "unexplained"
-    assert verdict.verdict_of(findings(380.0), gap(0.038)).name == "effects"  # 14 %
+    """330 of 1000 noises are 11 % of the squared gap."""
+    assert verdict.verdict_of(findings(330.0), gap(0.033)).name == "unexplained"
+    assert verdict.verdict_of(findings(300.0), gap(0.03)).name == "effects"  # 9 %
 
 
 @pytest.mark.parametrize(

@@ -24,8 +24,7 @@ PARTLY_HEAD = "Partly explained: {named}; more than the tolerance remains at {be
 REST = "More than the tolerance remains at {beyond}."
 IMPERFECT = "No candidate closes the rest, {rest} of the squared gap: the law is not quite that of the real system."
 NEAREST = "Nearest in the library: {nearest}."
-BEATEN = "A flexible force alone predicts held-out {held} far better than {them}."
-ON_TOP = "On top of {they}, a flexible force still closes {remains} of the recalibrated simulator's squared gap."
+ON_TOP = "Beside {them} a force is missing: it makes {remains} of the squared gap."
 FALLS = (
     "On held-out {held} {they} {reduce} the gap from {calibrated} to {with_effects}: {shown} of the squared gap above "
     "the noise is closed."
@@ -135,7 +134,6 @@ def _how_far(d: Diagnosis) -> list[str]:
         if d.verdict == "unexplained":
             remains = basis.get("remains") or 0.0
             out += [ON_TOP.replace("{remains}", percent(remains))] if remains > 0 else []
-            out += [BEATEN] if basis.get("beaten") and not remains > 0 else []
         out += [IMPERFECT] if far.beyond and d.verdict != "unexplained" and left > 0 else []
         out += [PROMISED] if finite(far.closed.get("realised")) else []
         out += [ELSEWHERE] if finite(far.closed.get("elsewhere")) else []

@@ -26,10 +26,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """When a place is worth telling."""
+    """When a place is mentioned. Rules of thumb, not counted.
 
-    worth: float = 0.1  # share of the gap that makes a joint worth a sentence
-    least_share: float = 0.15  # share of a joint's missing power that a region must explain to be told
+    Attributes:
+        worth: share of the gap from which on a joint has a sentence.
+        least_share: share of a joint's missing power that a region has to explain.
+    """
+
+    worth: float = 0.1
+    least_share: float = 0.15
 
 
 RULES = Rules()
@@ -94,7 +99,8 @@ def locate(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None, *, 
 
 def _spot(node: Nodes, found: Tree | None, share: float, ci: tuple[float, float]) -> Spot:
     size = float(np.sqrt(np.mean(node.force[node.used] ** 2))) if node.used.any() else 0.0
-    leaves = _told(found) if found is not None else ()
+    every = () if found is None or found.r2 <= RULES.least_share else found.leaves
+    leaves = tuple([leaf for leaf in every if leaf.share > RULES.least_share][:3])
     along = found is not None and found.target == ALONG
     return Spot(node.joint, node.force_unit, share, ci, size, found is not None, leaves, node.units, along)
 
@@ -123,16 +129,17 @@ def _maps(nodes: list[Nodes], without: Array, rng: np.random.Generator) -> list[
     return [m | {"significant": part.tolist()} for (m, _), part in zip(made, parts, strict=True)]
 
 
-def _told(found: Tree) -> tuple[Leaf, ...]:
-    return tuple([leaf for leaf in found.leaves if leaf.share > RULES.least_share and found.r2 > RULES.least_share][:3])
-
-
 @dataclass(frozen=True)
 class Limits:
-    """What counts as just now, and as small."""
+    """Which parts of a signature are mentioned. Rules of thumb, not counted.
 
-    recent: float = 0.1  # s after a reversal
-    small: float = 0.2  # of the force's rms: contributions below are not mentioned
+    Attributes:
+        recent: s after a reversal, in which a force counts as recent.
+        small: share of the force's rms, below which a part is not mentioned.
+    """
+
+    recent: float = 0.1
+    small: float = 0.2
 
 
 LIMITS = Limits()

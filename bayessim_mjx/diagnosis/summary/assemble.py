@@ -23,7 +23,7 @@ from bayessim_mjx.diagnosis.selection.models import BASE, systematic
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, ranked
 from bayessim_mjx.diagnosis.summary import effects_found, how_far, known_parameters
 from bayessim_mjx.diagnosis.summary.finer_steps import AtFinerSteps
-from bayessim_mjx.diagnosis.summary.verdict import Verdict, verdict_of
+from bayessim_mjx.diagnosis.summary.verdict import Verdict, force_in_numbers, verdict_of
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
@@ -55,7 +55,8 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
     notes = [*setup.warnings, *steps, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
-    more = {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
+    more: dict[str, Any] = {"force_left": force_in_numbers(found, far)}
+    more |= {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
     more |= {"experiments": proposal.details()} if proposal else {}
     experiment = proposal.to_dict(file) if proposal else {}
     result = Diagnosis(
@@ -94,7 +95,6 @@ def basis(found: Findings, verdict: Verdict) -> dict[str, Any]:
     return {
         "window": window,
         "remains": verdict.remains,
-        "beaten": verdict.beaten,
         "noise_memory": verdict.noise.memory * window if verdict.noise is not None else None,
         "far_off": verdict.bent,
         "builds_up": verdict.builds_up,

@@ -18,7 +18,7 @@ CLOSED = {"predicted": 0.66, "realised": 0.98, "elsewhere": 0.97, "nested": True
 ALONE = CLOSED | {"elsewhere": None, "nested": False}
 LEVEL = Gap(1.0, 21.4, 10.7, 0.866, 0.866, physical={"hinge": ROW}, shares=SHARES, closed=CLOSED)
 NO_EFFECTS = dataclasses.replace(LEVEL, with_effects=LEVEL.calibrated, closed={})
-BASIS = {"window": 0.5, "remains": 0.0, "beaten": False, "above_noise": True}
+BASIS = {"window": 0.5, "remains": 0.0, "above_noise": True}
 
 
 def effect(name, where, closed=0.5, rivals=(), shared=None, **numbers):
@@ -107,7 +107,7 @@ def every():
         "unexplained": made("unexplained", flexible=FORCE | {"on": "recalibrated"}, tried=["coulomb_friction"]),
         "unexplained by chance": made("unexplained", flexible=NOTHING, not_tried=short),
         "partly": made("unexplained", [FRICTION], some, remains=0.2, flexible=FORCE),
-        "nearest": made("unexplained", [GAIN], gap(with_effects=6.0), beaten=True, far_off=(3, 6)),
+        "nearest": made("unexplained", [GAIN], gap(with_effects=6.0), far_off=(3, 6)),
         "beside joints that keep their speed": made("unexplained", [GAIN], gap(with_effects=6.0, coasting=5.0)),
         "known parameters": made("effects", [FRICTION], parameters=known, builds_up=3.0),
         "one parameter": made("effects", [FRICTION], parameters=few, efforts="the motors follow"),

@@ -104,7 +104,7 @@ def _quoted(said: Said) -> Iterator[tuple[str, str]]:
         r"as floor,": [closed.get("realised")],
         r"they close (?=\S+ % of its gap)": [closed.get("elsewhere")],
         r"closes the rest,": [1.0 - sheet["effects"]],
-        r"still closes": [basis.get("remains")],
+        r"it makes": [basis.get("remains")],
         r"among all fitted ones:": [chance.get("answer")],
         r"rivals together:": [chance.get("rivals")],
         r"force removes": held,

@@ -29,7 +29,7 @@ def test_no_made_up_result_contradicts_itself(name):
         ("one effect", "as floor, 98 %", "as floor, 66 %", "share"),
         ("one effect", "fitted ones: 90 %", "fitted ones: 8.0 %", "share"),
         ("a remainder", "closes the rest, 7.0 %", "closes the rest, 66 %", "share"),
-        ("partly", "still closes 20 %", "still closes 80 %", "share"),
+        ("partly", "it makes 20 %", "it makes 80 %", "share"),
         ("partly", "force removes 75 %", "force removes 20 %", "share"),
         ("one effect", "2.1 %", "2.3 %", None),  # is quoted nowhere
         ("one effect", "1.1 % of the motion", "3.3 % of the motion", "source"),
