@@ -204,6 +204,7 @@ def run(todo: Sequence[Path], workers: int, minutes: float) -> None:
     usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
     free, running = usable[:workers], dict[int, tuple[Any, Path, float]]()
     until = time.monotonic() + 60 * minutes
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that runs end with it
     print(f"{len(waiting)} of {len(todo)} runs, {len(free)} at once, {minutes:g} minutes", flush=True)
     try:
         while time.monotonic() < until:
