@@ -1,7 +1,7 @@
 """Which answers change where a number of the diagnosis is halved or doubled.
 
     python benchmarks/diagnosis/sensitivity.py --cases frozen --numbers all --out benchmarks/records/sensitivity.json
-        [--workers N] [--minutes M] [--folder runs/sensitivity] [--page docs/decisions/numbers.md]
+        [--workers N] [--minutes M] [--folder logs/sensitivity] [--page docs/decisions/numbers.md]
 
 Numbers are those of `bayessim_mjx.diagnosis.selection.numbers`, as `Priors.least` or `HIDDEN`, or `MODULE:NAME` for one
 of another module of the diagnosis. A number is replaced in the text of its module before anything imports it: what is
@@ -334,7 +334,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, help="the record to write")
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="runs at once, one core each")
     parser.add_argument("--minutes", type=float, default=1e6, help="when they are over, running ones are killed")
-    parser.add_argument("--folder", type=Path, default=ROOT / "runs" / "sensitivity", help="of all runs")
+    parser.add_argument("--folder", type=Path, default=ROOT / "logs" / "sensitivity", help="of all runs")
     parser.add_argument("--commit", default="", help="of the record; default: the checkout's")
     parser.add_argument("--page", type=Path, help="page whose table gets the counts")
     parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
