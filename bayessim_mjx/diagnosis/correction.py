@@ -73,10 +73,10 @@ class FoundEffect:
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """How wide the priors are that a correction writes."""
+    """How wide the priors are that a correction writes. Rules of thumb, not measured."""
 
-    reach: float = 4.0  # sd that a range holds on both sides, where physics allows
-    least_sd: float = 1e-06  # of the range: a prior needs a width
+    reach: float = 4.0  # sd that a range holds on both sides, where physics allows: all but 6e-5 of a Gaussian
+    least_sd: float = 1e-06  # of the range: ten roundings of float32; a prior needs a width
     unknown_sd: float = 0.5  # of the way from neutral, where the diagnosis could not tell
 
 

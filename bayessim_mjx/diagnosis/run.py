@@ -60,7 +60,8 @@ def investigate(
     observer.known(setup, None)
     given = setup.fitter, setup.candidates, setup.settings
     found = selecting.select(*given, observer.progress, lambda state: observer.known(setup, state))
-    ended(setup)
+    if isinstance(setup.fitter, Remembering):
+        setup.fitter.journal = None  # fits of later stages are not kept
     optional = not (request.quick or request.verdict_only)
     chosen = [s for s in (STAGES if stages is None else stages) if optional or not s.optional]
     return carry_out(chosen, Findings(setup, found), time_left, observer)
@@ -129,22 +130,14 @@ def remembering(setup: Setup, folder: Path | None) -> Setup:
     """The setup with a fitter that stores its fits in a folder, and finds there those of an interrupted search."""
     if folder is None:
         return setup
-    return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, _question(setup), _code(setup))))
+    return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, *_asked(setup))))
 
 
-def ended(setup: Setup) -> None:
-    """The search is over: later fits are not kept."""
-    if isinstance(setup.fitter, Remembering):
-        setup.fitter.journal = None
+def _asked(setup: Setup) -> tuple[str, str]:
+    """Digests of what the fits depend on beside their code, and of the code: this package and the user's own effects.
 
-
-def _code(setup: Setup) -> str:
-    """A digest of the code that makes the fits: this package and the files of the user's own effects."""
-    return digest(versions.sources(), sorted({str(programs.source_of(type(e))) for e in setup.physics.effects}))
-
-
-def _question(setup: Setup) -> str:
-    """A digest of everything else that the fits depend on; the time that they may take is no part of it."""
+    The time that they may take is no part of it.
+    """
     fitter, model = setup.fitter, setup.physics.mj_model
     simulator = fitter.simulator
     raw = np.empty(mujoco.mj_sizeModel(model), np.uint8)
@@ -154,7 +147,9 @@ def _question(setup: Setup) -> str:
     arrays += [windows.group, windows.sigma_q, windows.sigma_v, windows.spread, fitter.theta, raw]
     each = [(c.label, c.coordinates, c.shapes, c.probes.tobytes()) for c in setup.candidates]
     every = replace(setup.settings, budget=budget.Budget())
-    return digest(*arrays, fitter.base, each, every, simulator.lanes, jax.default_backend(), versions.versions())
+    code = versions.sources(), sorted({str(programs.source_of(type(e))) for e in setup.physics.effects})
+    question = *arrays, fitter.base, each, every, simulator.lanes, jax.default_backend(), versions.versions()
+    return digest(*question), digest(*code)
 
 
 def _header(robot: Robot, model: Source, logs: Any, recorded: Sequence[Log]) -> dict[str, Any]:

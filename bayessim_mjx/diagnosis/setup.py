@@ -194,7 +194,7 @@ def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | No
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
     late = [] if shift is None else shift.notes(checked.period)
-    clocked = checked.gate if shift is None else checked.gate.clocked(shift.behind, shift.lead)
+    clocked = checked.gate if shift is None else checked.gate.moved(shift.lead)
     notes = [*steps.said(), *_faster(usable, float(checked.robot.mj_model.opt.timestep), dt), *late]
     return _Timed(step.robot(steps.robot), clocked, cuts, step, tuple(notes), tuple(steps.warnings()))
 

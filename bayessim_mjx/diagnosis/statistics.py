@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,17 +20,8 @@ from scipy.special import ndtr
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Levels:
-    """Of intervals and of what they divide by."""
-
-    level: float = 0.9
-    # degrees of freedom where one condition rules a mean of squares: measured, see above
-    ruled: float = 0.5
-
-
-LEVELS = Levels()
-Z90 = 1.645  # half the width of a Gaussian's 90 % interval, in standard deviations
+Z90 = 1.645  # half the width of a Gaussian's 90 % interval, in standard deviations; source: its 95 % quantile
+RULED = 0.5  # degrees of freedom where one condition rules a mean of squares; coverage as measured, see above
 NOTHING = (float("nan"), float("nan"))  # the interval of one condition
 
 
@@ -66,7 +56,7 @@ def error(replicates: Array) -> Array:
 
 def quantile(freedom: Array | float) -> Array:
     """Student's t that 90 % intervals reach to on either side."""
-    return np.asarray(stats.t.ppf((1 + LEVELS.level) / 2, freedom))
+    return np.asarray(stats.t.ppf(0.95, freedom))
 
 
 def interval(value: float, replicates: Array) -> tuple[float, float]:
@@ -100,7 +90,7 @@ def interval_of_rms(cost: Array, group: NDArray[np.int64]) -> tuple[float, float
         return NOTHING
     own = np.sum(cost) - rows @ cost
     replicates = np.log(np.maximum(rows @ cost, 1e-300) / rows.sum(1))
-    half = float(quantile(freedom(own, LEVELS.ruled)) * error(replicates))
+    half = float(quantile(freedom(own, RULED)) * error(replicates))
     centre = np.log(max(float(np.mean(cost)), 1e-300))
     # squares of numbers beyond 1e100 are of no use to anybody
     low, high = np.exp(np.clip([0.5 * (centre - half), 0.5 * (centre + half)], -230.0, 230.0))

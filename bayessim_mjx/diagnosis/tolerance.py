@@ -19,16 +19,9 @@ from bayessim_mjx.quantities import extent
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Default:
-    """What may stay unexplained: the larger of the two."""
-
-    # the default: the larger of so many noise sd and of this share of the range of motion
-    noises: float = 3.0
-    share: float = 0.02
-
-
-DEFAULT = Default()
+# What may stay unexplained where no user says so: the larger of so many noise sd and of this share of the range of
+# motion. Rules of thumb, not measured.
+NOISES, SHARE = 3.0, 0.02
 UNITS = {"rad": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180}, "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3}}
 _FORM = re.compile(r"(?P<value>[0-9.]+(?:e[+-]?[0-9]+)?)\s*(?P<unit>%|[a-z]*)")
 
@@ -143,7 +136,7 @@ def judge(model: mujoco.MjModel, motion: Array, noise: Array, asked: dict[int, L
     Args:
         motion, noise: `[nv]`, range of motion and standard deviation of the noise, rad or m.
     """
-    limit = np.maximum(DEFAULT.noises * noise, DEFAULT.share * motion)
+    limit = np.maximum(NOISES * noise, SHARE * motion)
     for dof, own in asked.items():
         limit[dof] = own.value * motion[dof] if own.relative else own.value
     given = np.isin(np.arange(model.nv), list(asked))

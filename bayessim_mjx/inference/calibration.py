@@ -24,7 +24,7 @@ from bayessim_mjx.inference.temperature import LEVELS, TEMPERATURES, temperature
 from bayessim_mjx.keys import branch
 from bayessim_mjx.quantities import percent, percent_estimate
 
-DRAWS = 256  # proposals per pair; those outside the box are left out
+DRAWS = 256  # proposals per pair, without those outside the box; source: cost alone, ranks in steps of 1/256
 FEWEST = 15  # pairs, at least, that a verdict needs; source: rule of thumb, not counted
 ALPHA = 0.01  # chance of another verdict on a calibrated posterior; source: a chosen level of the tests
 CALIBRATED, OVER, UNDER, BIASED, ODD = "calibrated", "over-confident", "under-confident", "biased", "miscalibrated"

@@ -15,7 +15,7 @@ Layers = list[tuple[Array, Array]]
 # 95 % of late measurements in place of 94, and fewer wrong noises. source: benchmarks/history.md, misspecification
 WIDTH, STEPS, BATCH, RATE = 128, 1500, 256, 3e-3
 ITERATIONS = 8  # of Levenberg and Marquardt's method; source: rule of thumb, not counted
-AT_ONCE = 1024  # rows explained at once
+AT_ONCE = 1024  # rows explained at once; source: memory alone
 
 
 def emulated(layers: Layers, u: Array) -> Array:

@@ -17,7 +17,7 @@ from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.inference.state import Data, FitState
 from bayessim_mjx.inference.train import objective_of
 
-SCORED = 256  # validation rows for which the truncated density is reported
+SCORED = 256  # validation rows for which the truncated density is reported; source: cost alone
 # sharpnesses of the parts that are tried on held-out rows; before there were several of each member, regions of
 # BayesSimIG's *fixed* held .738 .899 .976. source: benchmarks/history.md, posteriors; the range is a rule of thumb
 SHARPNESS = np.geomspace(0.35, 4.0, 21).astype(np.float32)

@@ -26,7 +26,7 @@ Heads = tuple[Array, Array, Array]  # log weights [n, K], centres [n, K, d], fac
 
 UNUSED = -60.0  # log weight of components that a member does not use; source: below float32's resolution
 CUT_POINTS = 16  # quasi-Monte-Carlo points of a component's mass inside the box, in training; source: cost alone
-AT_ONCE = 1024  # trajectories embedded at once
+AT_ONCE = 1024  # trajectories embedded at once; source: memory alone
 # log mass inside the box that training uses at least; source: rule of thumb, not counted
 LEAST_INSIDE = float(np.log(0.1))
 # of the parameters, those that are not trained by gradients; the last three belong to the parts of the mixture

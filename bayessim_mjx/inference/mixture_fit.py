@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 from bayessim_mjx.distributions import box
 from bayessim_mjx.inference.smc import ess_of
 
-DRAWS = 4096  # at most, that are fitted to
+DRAWS = 4096  # at most, that are fitted to; source: cost alone, others were not measured
 FLAT = 1.5  # sd, in widths of the cube: the density falls by 5 % over the cube; source: exp(-0.5^2 / (2 FLAT^2))
 # standard errors beyond which draws are not uniform by chance: .98 of uniform directions pass, and a direction that
 # passes wrongly loses less than its moments' chance would. source: benchmarks/records/flat_directions.json

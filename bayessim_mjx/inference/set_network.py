@@ -29,14 +29,14 @@ from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 LONGEST = 512  # features of a summary up to which they are pooled too; source: a choice, others were not measured
-AT_ONCE = 1024  # trajectories embedded at once, for the memory
+AT_ONCE = 1024  # trajectories embedded at once; source: memory alone
 
 Simulate = Callable[[Array, Array], Array]  # key, theta [m, d] -> summaries [m, D]
 MASS = 1e-3  # of a Gaussian that an ellipsoid leaves outside before it is widened; source: as `rounds.MASS`
 # standard deviations, times: with the posterior itself as region, its ends would look like knowledge.
 # source: a choice, others were not measured
 WIDER = 2.0
-POOL = 4096  # draws behind its mean and covariance
+POOL = 4096  # draws behind its mean and covariance, known to 1/64 of an sd; source: cost alone
 STEPS = 32  # of a walk, times the number of parameters; source: a choice, others were not measured
 
 

@@ -23,9 +23,9 @@ TEMPERATURES = np.geomspace(1.0, 4.0, 15).astype(np.float32)  # factors tried; s
 FEW = 64  # points behind the mass of a Gaussian in the box, 512 in Distribution.from_unit; source: cost alone
 Mixtures = tuple[Array, Array, Array]  # log weights [n, K], means [n, K, d], Cholesky factors of covariances
 
-DRAWS = 64  # of each posterior
+DRAWS = 64  # of each posterior; source: cost alone, levels in steps of 1/64
 MOST = 512  # rows in which levels are counted; source: cost alone
-TOGETHER = 64  # of them at once
+TOGETHER = 64  # of them at once; source: memory alone
 # factors on sharpness, tried; 1.1 to 1.2 were found to be enough on BayesSimIG's data. source: docs/inference.md
 FACTORS = np.geomspace(0.75, 1 / 0.75, 15).astype(np.float32)
 LEVELS = (0.5, 0.8, 0.95)  # mass of the regions of highest density in which truths are counted

@@ -21,7 +21,7 @@ from bayessim_mjx.inference.state import Data
 from bayessim_mjx.keys import GOLDEN
 from bayessim_mjx.linalg import REGRESSED, inverse_lower, product, ridge
 
-CURVE = 40  # points of the loss curves, at least
+CURVE = 40  # times, at least, that the losses are looked at; source: rule of thumb, not measured
 # factor on steps in the trials of bases: at the full rate whitening was once chosen on the damped pendulum, 6.2 nats
 # for 7.3; at half none of six seeds did. source: benchmarks/history.md, posteriors
 PACE = 0.5

@@ -19,8 +19,8 @@ from bayessim_mjx.logs.turns import placed
 from bayessim_mjx.logs.units import TIMES
 from bayessim_mjx.quantities import percent
 
-LARGEST = 1e15  # of a logged number: squares of larger ones are no longer numbers
-SHORTEST = 1e-6  # s between rows
+LARGEST = 1e15  # of a logged number: the sum of 1e8 squares of larger ones overflows float32
+SHORTEST = 1e-6  # s between rows; rule of thumb, not measured
 STREAMS = ("ctrl", "qpos", "qvel", "effort", "enabled")
 
 

@@ -22,9 +22,9 @@ class Form:
 
     Attributes:
         delimiter: one character. header: whether there is a line of names.
-        skip_rows: lines before the header, or before the first row where there is none.
+        skip_rows: lines before the header, or before the first row where there is none; of all text files.
         skip_after_header: lines between the header and the first row.
-        encoding, decimal, thousands: as the map states them, or None.
+        encoding: of all text files; decimal, thousands: marks in numbers (`numerals.Marks`); None: found in the file.
         lenient: a row of the wrong length becomes one that holds nothing (`bad_rows`).
     """
 
@@ -38,7 +38,7 @@ class Form:
     lenient: bool = False
 
 
-def read_csv(path: Path, form: Form | None = None) -> Table:
+def read_csv(path: Path, form: Form = Form()) -> Table:  # noqa: B008  # immutable
     """Read a CSV file; columns of a file without a header line are called 0, 1, 2 ...
 
     A column without a name is called `unnamed <its number>`, or left out where it is blank throughout, as after a comma
@@ -47,7 +47,6 @@ def read_csv(path: Path, form: Form | None = None) -> Table:
     Raises:
         UserError: no rows, a repeated column, a row of the wrong length, another delimiter, encoding or header.
     """
-    form = form or Form()
     text = lines_of(path, form.encoding, ALLOWED)[form.skip_rows :]
     own = named_delimiter(text[0]) if text and not form.skip_rows else None
     text, skipped = (text[1:], 1) if own else (text, form.skip_rows)

@@ -27,7 +27,7 @@ _TWO = re.compile(r"\d{1,2}:\d{2}")
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _ORDERS = {"day first": ("a", "b"), "month first": ("b", "a")}
 _DIGITS = re.compile(r"([.,]\d{6})\d+")  # strptime has microseconds at most
-DAY, HOUR = 86400.0, 3600.0
+DAY, HOUR = 86400.0, 3600.0  # s; source: the definition of the units
 ALLOWED = "allowed: seconds, or ISO 8601 with date and time as in 2026-03-01T10:15:02.250Z"
 MEND = "; another form needs `format` in the map (time: {column: ..., format: '%d/%m/%Y %H:%M:%S.%f'})"
 

@@ -13,8 +13,9 @@ from bayessim_mjx.logs.mapping import LogMap
 from bayessim_mjx.logs.stamps import WINDOW, better_clock, coarseness
 from bayessim_mjx.logs.table import Table
 
+# benchmarks/records/log_checks.json
 SURE = 1.2  # ratio of the residuals of both clocks, from which one is named
-UNEVEN = 0.1  # share of the steps that are off by more than a fifth
+UNEVEN = 0.1  # share of the steps that are off by more than a fifth; records/log_checks.json
 
 
 def say_better_clock(table: Table, columns: Mapping[str, Array], channels: Channels, log_map: LogMap) -> None:

@@ -12,15 +12,15 @@ import numpy as np
 from bayessim_mjx.config import read_yaml
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import stamps
+from bayessim_mjx.logs.csv_files import Form
 from bayessim_mjx.logs.log import Array, suggest
 from bayessim_mjx.logs.map_keys import plain, source_keys
 from bayessim_mjx.logs.table import Table
 from bayessim_mjx.logs.units import PERCENT, scale_of
 
-PLAIN = (
-    "files", "delimiter", "header", "skip_rows", "skip_after_header", "encoding", "decimal", "thousands", "bad_rows",
-    "hold", "rate",
-)  # fmt: skip
+WRITTEN = tuple(f.name for f in fields(Form) if f.name != "lenient")  # keys of a map that say how files are written
+PLAIN = ("files", *WRITTEN, "bad_rows", "hold", "rate")
+CHANNELS = ("ctrl", "qpos", "qvel", "streams")
 
 S = TypeVar("S", bound="Source")
 
@@ -180,9 +180,7 @@ class LogMap:
     """A whole map: which files, how they are written, and the source of every channel.
 
     Attributes:
-        files: pattern of the files in a folder; delimiter, header, skip_rows: of CSV files (skip_rows: of all texts).
-        skip_after_header: lines between the header and the first row. encoding: of text files.
-        decimal, thousands: marks in the numbers of CSV files, see `numerals.Marks`.
+        files: pattern of the files in a folder; form: how text files are written. Its fields are keys of the map.
         bad_rows: what becomes of rows that cannot be used: error, drop or nan (see `bad_rows.leave_out`).
         hold: how a command goes on from its row to the next: previous (None) or linear.
         time: s; rate: rows per second, in place of a column of times.
@@ -191,13 +189,7 @@ class LogMap:
     """
 
     files: str | None = None
-    delimiter: str = ","
-    header: bool = True
-    skip_rows: int = 0
-    skip_after_header: int = 0
-    encoding: str | None = None
-    decimal: str | None = None
-    thousands: str | None = None
+    form: Form = Form()
     bad_rows: str = "error"
     hold: str | None = None
     time: Clock = Clock("time")
@@ -218,7 +210,7 @@ class LogMap:
         """
         path = "map" if isinstance(source, Mapping) else str(source)
         content = source if isinstance(source, Mapping) else read_yaml(source)
-        allowed = [f.name for f in fields(cls) if f.name != "path"]
+        allowed = [*PLAIN, "time", *CHANNELS, "metadata"]
         for key in content:
             if key not in allowed:
                 raise UserError(f"{path}: unknown key {key!r}; {suggest(str(key), allowed)}")
@@ -231,10 +223,14 @@ class LogMap:
             )
         if "time" in content:
             settings["time"] = _source(path, "time", content["time"], Clock)
-        for stream in ("ctrl", "qpos", "qvel", "streams"):
+        form = Form(
+            **{k: settings.pop(k) for k in WRITTEN if k in settings},
+            lenient=settings.get("bad_rows", cls.bad_rows) != "error",
+        )
+        for stream in CHANNELS:
             block = _mapping(path, stream, content.get(stream, {}))
             settings[stream] = {str(k): _source(path, f"{stream}.{k}", v, Source) for k, v in block.items()}
-        return cls(**settings, metadata=_mapping(path, "metadata", content.get("metadata", {})), path=path)
+        return cls(**settings, form=form, metadata=_mapping(path, "metadata", content.get("metadata", {})), path=path)
 
     @property
     def names_channels(self) -> bool:
@@ -264,7 +260,7 @@ class LogMap:
 
     def channels(self) -> Iterator[tuple[str, Source, str]]:
         """(channel, where it comes from, the key for messages), but for the time."""
-        for stream in ("ctrl", "qpos", "qvel", "streams"):
+        for stream in CHANNELS:
             for name, source in getattr(self, stream).items():
                 channel = name if stream == "streams" else f"{stream}:{name}"
                 yield channel, source, f"{self.path}: {stream}.{name}"

@@ -13,11 +13,13 @@ from bayessim_mjx.logs.log import Array, Channels, Log, suggest
 from bayessim_mjx.logs.signals import estimate_velocity, noise_level
 from bayessim_mjx.logs.table import Table
 
-MIN_ROWS = 10
-MAX_GAP = 5.0  # sample periods without a sample after which a file is cut in two
+MIN_ROWS = 10  # of a run between two gaps; rule of thumb, not measured
+# Periods without a sample after which a file is cut in two, and across which no stream is interpolated. Rule of thumb;
+# files with gaps of 4 and of 8 periods: benchmarks/records/log_checks.json
+MAX_GAP = 5.0
 # of a velocity that is so many times the derivative of its position
 _KEYS = {"`unit: deg/s`": 180.0 / np.pi, "`unit: rpm`": 30.0 / np.pi, "`unit: rev/s`": 0.5 / np.pi, "`sign: -1`": -1.0}
-SHORT_GAP = 0.01  # s; shorter pauses are bridged however fast the file is
+SHORT_GAP = 0.01  # s; shorter pauses are bridged however fast the file is; rule of thumb, not measured
 
 
 def pieces(

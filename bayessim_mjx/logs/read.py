@@ -15,7 +15,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.absent import filled
 from bayessim_mjx.logs.bad_rows import leave_out
 from bayessim_mjx.logs.check import STREAMS, check_finite, check_motion, check_names, check_time
-from bayessim_mjx.logs.csv_files import Form, read_csv
+from bayessim_mjx.logs.csv_files import read_csv
 from bayessim_mjx.logs.doubts import check_units
 from bayessim_mjx.logs.duplicates import without_copies
 from bayessim_mjx.logs.files import FORMAT, Paths, distinct, files_of, map_of_folder, side_yaml
@@ -27,7 +27,6 @@ from bayessim_mjx.logs.pieces import MIN_ROWS, pieces
 from bayessim_mjx.logs.table import Table, read_npz
 from bayessim_mjx.physics import controllers
 
-FORM = ("delimiter", "header", "skip_rows", "skip_after_header", "encoding", "decimal", "thousands")
 LATEST = 1.0  # s by which commands may act later or earlier than their rows say
 
 
@@ -116,13 +115,12 @@ def table_of(path: Path, log_map: LogMap) -> Table:
     Raises:
         UserError: a file that cannot be read so.
     """
-    lenient = log_map.bad_rows != "error"
+    form = log_map.form
     if path.suffix == ".npz":
-        return replace(read_npz(path), lenient=lenient)
+        return replace(read_npz(path), lenient=form.lenient)
     if path.suffix == ".jsonl":
-        return read_jsonl(path, log_map.skip_rows, lenient, log_map.encoding)
-    form = {key: getattr(log_map, key) for key in FORM}
-    return read_csv(path, Form(**form, lenient=lenient))
+        return read_jsonl(path, form.skip_rows, form.lenient, form.encoding)
+    return read_csv(path, form)
 
 
 def _with_numbers(table: Table, columns: dict[str, Array]) -> dict[str, Array]:

@@ -9,10 +9,10 @@ from scipy.signal import savgol_coeffs, savgol_filter
 
 from bayessim_mjx.logs.log import Array, Channels
 
-MAX_WINDOW = 0.25  # s, the longest smoothing window
-_POLYNOMIAL = 3
+MAX_WINDOW = 0.25  # s, the longest smoothing window; rule of thumb, not measured
+_POLYNOMIAL = 3  # the least order whose derivative is exact where the acceleration grows; Savitzky and Golay 1964
 # Values that a channel has to show before its noise can be estimated: of two, nothing says whether they are one count
-# apart, so the noise may be anything.
+# apart, so the noise may be anything. Source: that count.
 LEVELS = 3
 
 
@@ -80,7 +80,8 @@ def derivative(time: Array, x: Array, sigma: float) -> tuple[Array, float]:
     even = np.interp(grid, time, x) if quantum(x) > 0 else CubicSpline(time, x)(grid)
     window = smoothing_window(even, step, sigma)
     rate = savgol_filter(even, window, _POLYNOMIAL, deriv=1, delta=step)
-    # Var[rate] = sigma^2 sum_k c_k^2, c = the filter's taps
+    # Var[rate] = sigma^2 sum_k c_k^2, c = the filter's taps; no position is known better than its rounding
+    sigma = max(sigma, 10.0 * float(np.finfo(np.float64).eps) * float(np.abs(x).max()))
     spread = sigma * float(np.linalg.norm(savgol_coeffs(window, _POLYNOMIAL, deriv=1, delta=step)))
     return CubicSpline(grid, rate)(time), spread
 

@@ -10,8 +10,8 @@ from typing import Any
 from bayessim_mjx.logs.csv_files import ALLOWED, DELIMITERS, is_number
 from bayessim_mjx.logs.texts import lines_of, named_delimiter
 
-HEAD = 200  # lines that are looked at
-MOST = 0.9  # share of the lines that have to have the same number of fields
+HEAD = 200  # lines that are looked at; rule of thumb, not measured
+MOST = 0.9  # share of the lines that have to have the same number of fields; rule of thumb, not measured
 
 
 def form_of(path: Path) -> dict[str, Any]:

@@ -14,8 +14,8 @@ from bayessim_mjx.logs.table import Table
 
 SINCE = (946684800.0, 4102444800.0)  # s since 1970: 2000 to 2100
 DAYS = (36526.0, 73050.0)  # the same in days since 1900, as spreadsheets count
-PERIODS = (1e-4, 1.0)  # s between rows of a log of a robot
-WINDOW = 7  # rows through which a parabola is put
+PERIODS = (1e-4, 1.0)  # s between rows of a log of a robot; rule of thumb, not measured
+WINDOW = 7  # rows through which a parabola is put; rule of thumb, not measured
 
 
 def seconds_of(raw: Array, table: Table, column: str) -> Array:

@@ -15,7 +15,7 @@ from bayessim_mjx.logs.table import Table
 
 TURN = 2.0 * np.pi
 HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
-MOST = 0.95  # share of the rows that have to agree
+MOST = 0.95  # share of the rows that have to agree; rule of thumb, not measured
 NEAR = 0.25 * TURN  # rad between a reading and its target, modulo a turn
 
 

@@ -31,7 +31,7 @@ from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round
 from bayessim_mjx.physics.tangent import in_tangent
 from bayessim_mjx.tracking import Record
 
-DRAWS = 1024  # thetas of one call
+DRAWS = 1024  # thetas of one call; source: cost alone, others were not measured
 # of the prior, at most: the domain of the next training has mass everywhere; source: rule of thumb, not counted
 SHARE = 1e-4
 PASSES = 5  # at most, of noise and posterior in turn; source: rule of thumb, not counted

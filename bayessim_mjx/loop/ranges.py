@@ -21,7 +21,7 @@ from bayessim_mjx.loop.sources import limits_of
 from bayessim_mjx.loop.state import Evidence, Loop, LoopState, Moving
 from bayessim_mjx.parameters.ranged import Ranged
 
-POOL = 4096  # draws tried at once
+POOL = 4096  # draws tried at once; source: memory alone
 
 
 def unmoved(space: Ranged) -> Moving:

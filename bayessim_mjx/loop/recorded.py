@@ -28,7 +28,7 @@ from bayessim_mjx.tracking import Record
 
 # error of a velocity estimated from positions, in its noise: it lags at transients; source: rule of thumb, not counted
 ESTIMATED_SPEED = 3.0
-REPLAYED = 512  # segments replayed at once at nominal parameters
+REPLAYED = 512  # segments replayed at once at nominal parameters; source: memory alone
 
 
 @dataclasses.dataclass(frozen=True, eq=False)  # compared by identity: static under jit

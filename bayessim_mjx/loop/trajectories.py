@@ -27,7 +27,7 @@ from bayessim_mjx.physics.warp import refuse_overflow
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory
 
-CHUNK = 2500  # trajectories simulated at once while collecting
+CHUNK = 2500  # trajectories simulated at once while collecting; source: memory alone
 ROOM = 2**27  # bytes that draws of measurement noise may fill
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from bayessim_mjx.diagnosis.result import Diagnosis
+from bayessim_mjx.diagnosis.statistics import Z90
 from bayessim_mjx.report import marks, motion_figures, rival_figures
 from bayessim_mjx.report.choice import choice
 from bayessim_mjx.report.look import STAGE
@@ -46,7 +47,7 @@ def parameters(d: Diagnosis) -> dict[str, Any]:
         mean, sd = p.get("mean"), p.get("sd")
         ranged = known_span((p.get("low"), p.get("high")))
         limits = ranged or marks.scale_of([mean, p.get("nominal")], zero=False)
-        ci = (mean - 1.645 * sd, mean + 1.645 * sd) if finite(mean) and finite(sd) else None
+        ci = (mean - Z90 * sd, mean + Z90 * sd) if finite(mean) and finite(sd) else None
         colour = STAGE["nominal"] if p.get("structural") else STAGE["with_effects"]
         rows.append(
             {

@@ -18,7 +18,7 @@ from bayessim_mjx.diagnosis.equation_error import terms
 from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term, used
 from bayessim_mjx.diagnosis.equation_error.search import Found, Proposal, contradicted, search
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
-from bayessim_mjx.diagnosis.logcheck import loads, rigid_body
+from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
 from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel, channels_of
 from bayessim_mjx.logs.log import Log
 
@@ -141,7 +141,7 @@ def check(
     if not used(sums).any():
         return Look(seconds=time.monotonic() - began)
     known = terms.known(model, sums.layout, accuracy or {}, sums.period)
-    carried = data_sheet.rated(loads.carried(model, _places(logs)), rating or {})
+    carried = data_sheet.rated(drives.carried(model, _places(logs)), rating or {})
     offered = terms.effects(model, sums.layout, sums.source, carried)
     found, unit = _searched(sums, known, offered, _stated(logs))
     # the model as it is; how late efforts are logged is no fault of it

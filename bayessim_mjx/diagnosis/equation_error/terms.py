@@ -13,7 +13,7 @@ from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY
 from bayessim_mjx.diagnosis.equation_error.fit import Term
 from bayessim_mjx.diagnosis.equation_error.sums import Layout
-from bayessim_mjx.diagnosis.logcheck import loads, rigid_body
+from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of
 from bayessim_mjx.diagnosis.logcheck.regressor import TILT
 from bayessim_mjx.effects.support.site import element_names
@@ -143,7 +143,7 @@ def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term
         bare = model.body_weldid[body] != body and model.body_mass[body] <= 0
         if carried[body] <= 0 or bare:
             continue
-        reach = loads.reach(model, body)
+        reach = drives.reach(model, body)
         most = float(carried[body])
         shape = _load(layout, base, centre, turn)
         low, high = np.array([0.0, *(3 * [-np.inf])]), np.array([most, *(3 * [np.inf])])
@@ -166,7 +166,7 @@ def links(model: mujoco.MjModel, layout: Layout) -> list[Term]:
             ends = [rigid_body.inertial(mass, centre + sign * axis, none) for sign in (1, -1)]
             shape[:, own, k] = (ends[0] - ends[1]) / 2  # exact: it is quadratic
         shape[:, own, 3] = rigid_body.inertial(0.0, centre, axes @ np.diag(model.body_inertia[body]) @ axes.T)
-        sd = np.array([*(q.deviation * loads.size(model, body) for q in places), inertia.deviation])
+        sd = np.array([*(q.deviation * drives.size(model, body) for q in places), inertia.deviation])
         name = element_names(model, "body")[body]
         out.append(_wide("inertial_parameters", name, shape, -np.inf, np.inf, _link, sd=sd))
     return out

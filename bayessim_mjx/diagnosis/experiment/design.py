@@ -23,7 +23,7 @@ from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
 
 Array = NDArray[np.float64]
-DRAWS = 8  # from the posterior of the truth's parameters
+DRAWS = 8  # from the posterior of the truth's parameters; rule of thumb, not measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +91,17 @@ class Scorer:
 
     def _evidence(self, where: list[tuple[list[Fit], NDArray[np.int64]]], scale: float, full: int) -> Array:
         m = len(self.models)
-        out = np.zeros((m, m))
+        out, discount, samples = (
+            np.zeros((m, m)),
+            scale * self.ratio / self.misfit,
+            full * self.fitter.size * self.ratio,
+        )
         for i in range(m):
             own = self._quadratic(where, i, i)
-            out[i, i] = self._sharper(own[2], i, scale)
+            out[i, i] = self._sharper(own[2], i, discount[i])
             for j in range(m):
                 if i != j:
-                    out[i, j] = self._adapted(own, self._quadratic(where, i, j), i, j, scale, full)
+                    out[i, j] = self._adapted((i, own), (j, self._quadratic(where, i, j)), discount[i], samples[i])
         return out
 
     def _quadratic(self, where: list, i: int, j: int) -> tuple[float, Array, Array]:
@@ -111,17 +115,15 @@ class Scorer:
             c, g, S = c + q.c.sum(), g + q.g.sum(0), S + q.S.sum(0)
         return float(c), g, S
 
-    def _adapted(self, own: tuple, other: tuple, i: int, j: int, scale: float, full: int) -> float:
+    def _adapted(self, own: tuple, other: tuple, discount: float, samples: float) -> float:
         """Mean over i's posterior of N/2 log((N + D_ij) / (N + D_ii)), half the difference of the D if they are small.
 
         D_ij = min over dp of discount |y_i(p_i + dq) - y_j(p_j + dp)|^2 + dp' P_j dp, dq drawn from the posterior that
         the logs leave of i: how large an effect really is matters, and they may hardly know.
         """
-        discount = scale * self.ratio[i] / self.misfit[i]
-        samples = full * self.fitter.size * self.ratio[i]
         gains = []
-        for dq in self.draws[i]:
-            rival, truth = (self._distance(q, dq, k, discount) for q, k in ((other, j), (own, i)))
+        for dq in self.draws[own[0]]:
+            rival, truth = (self._distance(q, dq, k, discount) for k, q in (other, own))
             gains.append(0.5 * samples * np.log((samples + rival) / (samples + truth)))
         return max(float(np.mean(gains)), 0.0)
 
@@ -142,10 +144,10 @@ class Scorer:
         _, _, low, high = self.models[i].fit.prior()
         return np.clip(np.concatenate([half, -half]), low, high)
 
-    def _sharper(self, S: Array, i: int, scale: float) -> float:
+    def _sharper(self, S: Array, i: int, discount: float) -> float:
         k = self.models[i].size
         worst, before = self.loosest(i)
-        after = np.linalg.pinv(self.posterior[i] + scale * self.ratio[i] / self.misfit[i] * S[:k, :k])[worst, worst]
+        after = np.linalg.pinv(self.posterior[i] + discount * S[:k, :k])[worst, worst]
         return float(0.5 * np.log(before / max(after, 1e-300)))
 
     def loosest(self, i: int) -> tuple[int, float]:

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.experiment.design import Scored, Scorer
-from bayessim_mjx.diagnosis.experiment.excitation import Excitation, Limits, limits_of, menu
-from bayessim_mjx.diagnosis.experiment.rehearsal import Drives, Played, Rehearsal
+from bayessim_mjx.diagnosis.experiment.excitation import Excitation, Room, menu
+from bayessim_mjx.diagnosis.experiment.limits import Drives, Limits, limits_of
+from bayessim_mjx.diagnosis.experiment.rehearsal import Played, Rehearsal
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model, nats
@@ -31,11 +32,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Budget:
-    """What a proposal may cost, and how many experiments are looked at."""
+    """What a proposal may cost, how many experiments are looked at, and when one is of use.
+
+    Rules of thumb, not measured, but for `nothing`: below it evidence is not worth more than a bare mention (Kass and
+    Raftery 1995, 2 ln B < 2).
+    """
 
     seconds: float = 10.0
     most: int = 4  # models compared
-    nothing: float = 1.0  # nats: less separates nobody
+    nothing: float = 1.0  # nats: less separates no models
     mild: float = 10.0  # nats: below, evidence between two models is called a tie
     budget: int = 6000  # windows simulated for a first look at the whole menu
     final: int = 3  # experiments looked at in full
@@ -102,7 +107,7 @@ def propose(
 
     Args:
         rivals_models: models to be told from the winner; None: its rivals, and without any the closest losers.
-        limits: see `excitation.limits_of`.
+        limits: see `limits.limits_of`.
     """
     setup, seed = found.setup, found.setup.seed
     cut, model = setup.fitter.simulator.windows, setup.physics.mj_model
@@ -118,12 +123,13 @@ def propose(
     stand = Rehearsal(setup, effects, time, allowed)
     joints = _touched(stand.drives.joints(), models, model)
     loaded = sorted(joints, key=lambda n: -setup.scales.force[joints[n]])[: BUDGET.alone]
-    every = menu(time, joints, loaded, stand.half, allowed.speed, stand.release, seed) if joints else []
+    room = Room(time, stand.half, allowed.speed)
+    every = menu(room, joints, loaded, stand.release, seed) if joints else []
     scored = _look(scorer, stand, every)
     attended = _with_help(scorer, stand, scored, model)
     final = _in_full(scorer, stand, scored, attended)
     safe = {s.played.excitation.name for s in scored}
-    chosen = _decide(scorer, stand, final, scored, attended, contested)
+    chosen = _decide(scorer, stand, final, [*scored, *attended], contested)
     return replace(chosen, unsafe=[e.name for e in every if e.name not in safe])
 
 
@@ -172,8 +178,7 @@ def _look(scorer: Scorer, stand: Rehearsal, every: Sequence[Excitation]) -> list
     if not played:
         return []
     columns = sum(1 + m.size + 2 * scorer.fitter.simulator.nv for m in scorer.models)
-    full = (len(stand.time)) // scorer.fitter.simulator.windows.steps
-    each = int(np.clip(BUDGET.budget / (columns * len(played)), 2, full))
+    each = int(np.clip(BUDGET.budget / (columns * len(played)), 2, stand.count))
     pairs = scorer.score(played, shift, each)
     return sorted((_scored(scorer, p, e) for p, e in zip(played, pairs, strict=True)), key=lambda s: -s.evidence)
 
@@ -190,9 +195,8 @@ def _with_help(scorer: Scorer, stand: Rehearsal, scored: list[Scored], model: An
     for own in helps(scorer.setup) if top else []:
         gravity = np.asarray(jax.jit(tilted)(model.opt.gravity, *own.tilt))
         played = [p for p in stand.play(top, _thetas(scorer, own.shift), gravity) if p.safe]
-        full = len(stand.time) // scorer.fitter.simulator.windows.steps
         if played:
-            pairs = scorer.score(played, own.shift, max(2, full // 3))
+            pairs = scorer.score(played, own.shift, max(2, stand.count // 3))
             out += [_scored(scorer, p, e, own) for p, e in zip(played, pairs, strict=True)]
     return sorted(out, key=lambda s: -s.evidence)
 
@@ -201,16 +205,13 @@ def _in_full(scorer: Scorer, stand: Rehearsal, scored: list[Scored], attended: l
     """The best ones on all of their windows."""
     if not scored:
         return []
-    full = len(stand.time) // scorer.fitter.simulator.windows.steps
     best = [s.played for s in scored[: BUDGET.final]]
-    pairs = scorer.score(best, np.zeros(len(scorer.fitter.theta)), full)
+    pairs = scorer.score(best, np.zeros(len(scorer.fitter.theta)), stand.count)
     exact = [_scored(scorer, p, e) for p, e in zip(best, pairs, strict=True)]
     return sorted([*exact, *attended[:2]], key=lambda s: -s.evidence)
 
 
-def _decide(
-    scorer: Scorer, stand: Rehearsal, final: list[Scored], scored: list[Scored], attended: list[Scored], contested: bool
-) -> Experiment:
+def _decide(scorer: Scorer, stand: Rehearsal, final: list[Scored], looked: list[Scored], contested: bool) -> Experiment:
     labels = [title(m) for m in scorer.models]
     alone = [s for s in final if not s.needs]
     chosen = alone[0] if alone else None
@@ -222,8 +223,7 @@ def _decide(
     useful = chosen is not None and (chosen.evidence > BUDGET.nothing or (len(labels) == 1 and chosen.evidence > 0.1))
     why = reason(scorer, chosen, labels, contested, useful)
     kept = {s.name for s in final}
-    table = [*final, *(s for s in [*scored, *attended] if s.name not in kept)]
-    everything = sorted(table, key=lambda s: -s.evidence)
+    everything = sorted([*final, *(s for s in looked if s.name not in kept)], key=lambda s: -s.evidence)
     return Experiment(
         name=chosen.name if chosen is not None and useful else "none",
         why=why,
@@ -250,7 +250,7 @@ def _named(pairs: Array, labels: Sequence[str]) -> list[dict[str, Any]]:
     ]
 
 
-PAYLOAD_SHARE = 0.5  # of the largest payload that is thought possible at the body
+PAYLOAD_SHARE = 0.5  # of the largest payload that the body is thought to carry; rule of thumb, not measured
 STANDING = (("turned on its side (90 degrees about the world's x axis)", (math.pi / 2, 0.0)),
             ("turned forward (90 degrees about the world's y axis)", (0.0, math.pi / 2)))  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -14,8 +15,8 @@ from flax import struct
 from numpy.typing import NDArray
 
 from bayessim_mjx.compat import compiler_options
-from bayessim_mjx.diagnosis.experiment.drives import Drives, drives_of
-from bayessim_mjx.diagnosis.experiment.excitation import Excitation, Limits, middle
+from bayessim_mjx.diagnosis.experiment.excitation import Excitation
+from bayessim_mjx.diagnosis.experiment.limits import Limits, drives_of, middle
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Drive, Physics, control_step
@@ -25,15 +26,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How an experiment is rehearsed and made smaller until it keeps its limits."""
+    """How an experiment is rehearsed and made smaller until it keeps its limits. Rules of thumb, not measured."""
 
-    lanes: int = 32  # worlds in one call
+    lanes: int = 32  # worlds in one call; the results do not depend on it
     rounds: int = 5  # of making an experiment smaller until it is safe
-    shrink: float = 0.7
-    slack: float = 1.02  # of a limit: rounding and noise in what the logs did
 
 
 RULES = Rules()
+KEPT = 1.0 + 10.0 * float(np.finfo(np.float32).eps)  # share of a limit that may be used: all of it, but for rounding
 
 
 class Plan(struct.PyTreeNode):
@@ -83,6 +83,11 @@ class Rehearsal:
         self._run = jax.jit(jax.vmap(self._one), compiler_options=compiler_options())
 
     @property
+    def count(self) -> int:
+        """Windows of one experiment."""
+        return len(self.time) // self.windows.steps
+
+    @property
     def release(self) -> tuple[str, ...]:
         """Joints that can be let go."""
         d = self.drives
@@ -123,9 +128,10 @@ class Rehearsal:
             for k, own in zip(left, runs, strict=True):
                 worst = max(self._used(*run) for run in own)
                 log = self._log(excitations[k], *own[0])
-                done[k] = Played(excitations[k], float(scale[k]), log, worst, worst <= RULES.slack)
+                done[k] = Played(excitations[k], float(scale[k]), log, worst, worst <= KEPT)
             left = [k for k in left if not done[k].safe]
-            scale[left] *= RULES.shrink
+            # squared, since some of it does not shrink along, as what gravity pulls; no more than to a half
+            scale[left] *= [max(done[k].worst ** -2, 0.5) for k in left]
             if not left:
                 break
         return [done[k] for k in range(len(excitations))]
@@ -160,7 +166,7 @@ class Rehearsal:
         ref = self.start[d.q] + offset[:, d.v]
         needed = np.zeros_like(offset)
         if "torque" in d.kind and not np.any(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
-            needed = _inverse(model, self.start, d, offset, dt, gravity)
+            needed = self._inverse(offset, gravity)
         kinds = np.array(d.kind)
         feed = np.where(
             kinds == "torque",
@@ -171,6 +177,21 @@ class Rehearsal:
         )
         arrays = (ref, speed[:, d.v], feed, e.live[:, d.v], self.start)
         return Plan(*(jnp.asarray(np.asarray(x, np.float32)) for x in arrays))
+
+    def _inverse(self, offset: Array, gravity: Array | None) -> Array:
+        """Generalised forces `[T, nv]` of the nominal model along the reference."""
+        d, dt, model = self.drives, self.windows.dt, copy.copy(self.setup.physics.mj_model)
+        if gravity is not None:
+            model.opt.gravity[:] = gravity
+        data, out = mujoco.MjData(model), np.zeros_like(offset)
+        speed = np.gradient(offset, dt, axis=0)
+        acceleration = np.gradient(speed, dt, axis=0)
+        for k in range(len(offset)):
+            data.qpos[:], data.qvel[:], data.qacc[:] = self.start, speed[k], acceleration[k]
+            data.qpos[d.q] = self.start[d.q] + offset[k, d.v]
+            mujoco.mj_inverse(model, data)
+            out[k] = data.qfrc_inverse
+        return out
 
     def _turn(self, offset: Array, i: int) -> float:
         """s, time in which actuator i can turn the motion round with half of its effort."""
@@ -229,21 +250,3 @@ def _rounded(x: Array, width: float, dt: float) -> Array:
         ends = np.pad(x, (rows // 2, rows - 1 - rows // 2), mode="edge")
         x = np.convolve(ends, np.ones(rows) / rows, mode="valid")
     return x
-
-
-def _inverse(model: mujoco.MjModel, start: Array, d: Drives, offset: Array, dt: float, gravity: Array | None) -> Array:
-    """Generalised forces `[T, nv]` of the nominal model along the reference."""
-    import copy
-
-    model = copy.copy(model)
-    if gravity is not None:
-        model.opt.gravity[:] = gravity
-    data, out = mujoco.MjData(model), np.zeros_like(offset)
-    speed = np.gradient(offset, dt, axis=0)
-    acceleration = np.gradient(speed, dt, axis=0)
-    for k in range(len(offset)):
-        data.qpos[:], data.qvel[:], data.qacc[:] = start, speed[k], acceleration[k]
-        data.qpos[d.q] = start[d.q] + offset[k, d.v]
-        mujoco.mj_inverse(model, data)
-        out[k] = data.qfrc_inverse
-    return out

@@ -18,7 +18,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import SPAN
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
 from bayessim_mjx.diagnosis.fitting.substep_errors import Case, Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
-from bayessim_mjx.diagnosis.logcheck.timing import SURE, Late
+from bayessim_mjx.diagnosis.logcheck.timing import SURE
 
 Array = NDArray[np.float64]
 Shifted = Callable[[float], Windows]  # s -> the windows with commands that act so much later
@@ -65,11 +65,6 @@ class Shift:
     apart: float
     seen: float
     step: float
-
-    @property
-    def behind(self) -> Late:
-        """Commands behind their rows (`Timing.commands`)."""
-        return Late(self.late, self.error)
 
     @property
     def certain(self) -> bool:

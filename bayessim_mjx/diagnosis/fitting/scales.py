@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import data_sheet
-from bayessim_mjx.diagnosis.logcheck import loads
+from bayessim_mjx.diagnosis.logcheck import drives
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.site import element_names
 from bayessim_mjx.errors import UserError
@@ -69,8 +69,8 @@ class Scales:
             below = float(model.body_subtreemass[i])
             mass = max(float(model.body_mass[i]), 0.1 * below)
             load = max(LIMITS.load * mass, float(self.carried[i]))
-            own = {"mass": mass, "weight": below * gravity, "size": loads.size(model, i)}
-            return own | {"carried": load, "tool": loads.reach(model, i)}
+            own = {"mass": mass, "weight": below * gravity, "size": drives.size(model, i)}
+            return own | {"carried": load, "tool": drives.reach(model, i)}
         return {"moment": _moment(model)}
 
     def _of_dof(self, v: int) -> dict[str, float]:
@@ -118,7 +118,7 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
         command=np.maximum(command, 1e-9),
         effort=effort,
         moves=ptp > 10 * noise + 1e-9,
-        carried=data_sheet.rated(loads.carried(model, np.array(places)), rating or {}),
+        carried=data_sheet.rated(drives.carried(model, np.array(places)), rating or {}),
         period=float(np.median([log.period for log in logs])),
     )
 

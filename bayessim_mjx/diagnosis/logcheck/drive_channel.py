@@ -15,23 +15,21 @@ from bayessim_mjx.logs.log import Array, Log
 
 @dataclass(frozen=True)
 class Limits:
-    """When a drive follows its command. Error rates: benchmarks/records/first_look.json."""
+    """When a drive follows its command. Error rates: benchmarks/records/log_checks.json."""
 
-    scale: float = 0.03
-    left: float = 0.02  # of the effort, root mean square
-    peak: float = 0.06  # largest, of the same: a limit acts in few rows
-    constant: float = 0.03
+    same: float = 0.03  # share by which a scale may be off, and a constant of the effort, rms
+    left: float = 0.02  # of the effort, rms; in each row three times as much: a limit acts in few rows
     # of the encoders' noise, taken for white: steps of an encoder are slower, and come through filters
     steps: float = 5.0
     # of each of a servo's two terms, stiffness and damping: so well they are known from the positions
     terms: float = 0.01
     hidden: float = 0.1  # uncertainty of the scale above which a servo's effort is not told from its command
     late: float = 1.5  # periods of the log
-    echo: float = 1e-6  # of the effort: closer than any measurement comes to a command
 
 
 LIMITS = Limits()
-ROWS = 4  # of commands that an effort may come from: this one and those before; a choice, not counted
+ECHO = 10.0 * float(np.finfo(np.float32).eps)  # of the effort: no measurement comes so close to a command
+ROWS = 4  # of commands that an effort may come from: this one and those before; a rule of thumb, not measured
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ class Channel:
     @property
     def static(self) -> bool:
         """Whether nothing but a scale and a constant lies between command and effort."""
-        return self.left < LIMITS.left and self.peak < LIMITS.peak and not self.echo
+        return self.left < LIMITS.left and self.peak < 3.0 * LIMITS.left and not self.echo
 
     @property
     def identified(self) -> bool:
@@ -73,13 +71,13 @@ class Channel:
     @property
     def off(self) -> float:
         """The scale where it is surely not 1, else 1."""
-        sure = LIMITS.scale + 3.0 * self.deviation + 2.0 * self.noise**2 + LIMITS.terms * self.cancels
+        sure = LIMITS.same + 3.0 * self.deviation + 2.0 * self.noise**2 + LIMITS.terms * self.cancels
         return self.scale if abs(self.scale - 1.0) > sure and self.identified and not self.echo else 1.0
 
     @property
     def shifted(self) -> float:
         """The constant where it is surely not 0, else 0."""
-        sure = (LIMITS.constant + self.left / 5.0) * self.size
+        sure = (LIMITS.same + self.left / 5.0) * self.size
         return self.constant if abs(self.constant) > sure and self.identified and not self.echo else 0.0
 
 
@@ -193,6 +191,6 @@ def _echo(pairs: Sequence[_Pair]) -> bool:
         x = np.concatenate([p.raw[0, : p.raw.shape[1] - late] for p in pairs])
         y = np.concatenate([p.raw[1, late:] for p in pairs])
         scale = float(x @ y) / max(float(x @ x), 1e-300)
-        if np.abs(y - scale * x).max() < LIMITS.echo * (float(np.sqrt(np.mean(y**2))) + 1e-300):
+        if np.abs(y - scale * x).max() < ECHO * (float(np.sqrt(np.mean(y**2))) + 1e-300):
             return True
     return False

@@ -8,29 +8,17 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.logcheck import single_log
+from bayessim_mjx.diagnosis.logcheck import effort, single_log
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort, looped
-from bayessim_mjx.diagnosis.logcheck.effort import LIMITS as OF_EFFORT
-from bayessim_mjx.diagnosis.logcheck.effort import Relation, relations
-from bayessim_mjx.diagnosis.logcheck.links import offsets
-from bayessim_mjx.diagnosis.logcheck.single_log import Finding, refuse, warn
-from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing, pooled
+from bayessim_mjx.diagnosis.logcheck.effort import Relation
+from bayessim_mjx.diagnosis.logcheck.single_log import Finding
+from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing, offsets, pooled
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import Velocity, agreeing, velocities
-from bayessim_mjx.quantities import listed, percent
+from bayessim_mjx.quantities import listed
 
-FEW = 3  # names that a sentence lists
-
-
-@dataclass(frozen=True)
-class Limits:
-    """When a joint follows its target. A rule of thumb, not counted."""
-
-    alike: float = 5.0  # at most so many times a target's range is the range of what follows it
-
-
-LIMITS = Limits()
+FEW = 3  # names that a sentence lists; wording alone, a rule of thumb
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +101,10 @@ class Gate:
         own = iter(logs)
         return replace(self, reports=tuple(replace(r, log=next(own)) if r.usable else r for r in self.reports))
 
-    def clocked(self, commands: Late, moved: float) -> Gate:
-        """With the lateness of the commands, and with logs whose commands act `moved` s later than they did."""
-        reports = tuple(replace(r, log=r.log.shifted(moved)) for r in self.reports) if moved else self.reports
-        return replace(self, reports=reports, timing=self.timing.with_commands(commands, moved))
+    def moved(self, late: float) -> Gate:
+        """With logs whose commands act `late` s later than they did."""
+        reports = tuple(replace(r, log=r.log.shifted(late)) for r in self.reports) if late else self.reports
+        return replace(self, reports=reports, timing=replace(self.timing, moved=self.timing.moved + late))
 
     def _not_compared(self) -> tuple[str, ...]:
         """One sentence per reason: many logs of many joints would bury everything else."""
@@ -147,12 +135,10 @@ def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
     reports = tuple(_report(log, mj_model, dt) for log in logs)
     usable = [r for r in reports if r.usable]
     seen = [v for r in usable for v in r.velocities]
-    periods = [r.log.period for r in usable]
-    motion = pooled((e.joint, e.late) for r in usable for e in _first(r.relations))
-    velocities = pooled((v.channel, Late(v.lag)) for v in seen)
+    first = [(e.joint, e.late) for r in usable for e in _first(r.relations)]
     efforts = pooled(own for r in usable if not r.log.lost for own in offsets(r.log, mj_model))
-    timing = Timing(float(np.median(periods)) if periods else dt, dt, velocities, motion, efforts)
-    return Gate(reports, agreeing(seen, max([dt, *periods])), timing)
+    timing = Timing(pooled((v.channel, Late(v.lag)) for v in seen), pooled(first), efforts)
+    return Gate(reports, agreeing(seen, max([dt, *(r.log.period for r in usable)])), timing)
 
 
 def _first(related: Sequence[Relation]) -> list[Relation]:
@@ -173,12 +159,13 @@ def _report(log: Log, mj_model: mujoco.MjModel, dt: float) -> Report:
     own = _alone(log, dt)
     if any(f.kind == "refused" for f in own):
         return Report(log, own)  # nothing further can be computed from it
-    related = () if log.lost else tuple(relations(log, mj_model))  # forces on a joint need the motion of all
+    related = () if log.lost else tuple(effort.relations(log, mj_model))  # forces on a joint need the motion of all
     seen = tuple(velocities(log))
     step = max(dt, log.period)
     targets = _targets(log, mj_model)
+    behind = [Finding("warning", v.sentence()) for v in seen if not v.usable(step)]
     own += (*single_log.clipped(log, targets), *single_log.units(log, _vouched(log, mj_model, related, targets)))
-    return Report(log, (*own, *_of_velocity(seen, step), *_of_effort(related)), related, seen)
+    return Report(log, (*own, *behind, *effort.remarks(related)), related, seen)
 
 
 def _targets(log: Log, mj_model: mujoco.MjModel) -> dict[str, Array]:
@@ -193,7 +180,7 @@ def _targets(log: Log, mj_model: mujoco.MjModel) -> dict[str, Array]:
 
 def _vouched(log: Log, mj_model: mujoco.MjModel, related: Sequence[Relation], targets: Mapping[str, Array]) -> set[str]:
     """Joints whose positions have the model's unit: its dynamics, its range or its drives' targets say so."""
-    found = {r.joint for r in related if r.source == "ctrl" and (r.explained or 0.0) >= OF_EFFORT.doubtful}
+    found = {r.joint for r in related if r.source == "ctrl" and (r.explained or 0.0) >= effort.LIMITS.doubtful}
     for j, joint in enumerate(log.joints):
         q = log.qpos[:, log.channels.columns(joint).start]
         low, high = mj_model.jnt_range[j]
@@ -201,44 +188,7 @@ def _vouched(log: Log, mj_model: mujoco.MjModel, related: Sequence[Relation], ta
         if mj_model.jnt_limited[j] and low - room <= q.min() and q.max() <= high + room:
             found.add(joint)
         moved = np.ptp(targets[joint]) if joint in targets else 0.0
-        if moved > 0 and 1 / LIMITS.alike < np.ptp(q) / moved < LIMITS.alike:
+        # halfway, on a logarithmic scale, to degrees, the unit that is nearest to the model's
+        if moved > 0 and np.ptp(q) > 0 and abs(np.log(np.ptp(q) / moved)) < 0.5 * np.log(np.degrees(1.0)):
             found.add(joint)
     return found
-
-
-def _of_velocity(seen: Sequence[Velocity], step: float) -> list[Finding]:
-    return [warn(v.sentence()) for v in seen if not v.usable(step)]
-
-
-def _of_effort(related: Sequence[Relation]) -> list[Finding]:
-    """A log is refused where at least half of its joints have no effort that fits their motion."""
-    best: dict[str, Relation] = {}
-    for r in related:
-        if r.explained is not None and (r.joint not in best or r.explained > (best[r.joint].explained or 0.0)):
-            best[r.joint] = r
-    bad = [r for r in best.values() if r.refused]
-    out: list[Finding] = []
-    for r in best.values():
-        assert r.explained is not None
-        if r in bad:
-            out.append((refuse if 2 * len(bad) >= len(best) else warn)(_unrelated(r)))
-        elif r.explained < OF_EFFORT.doubtful:
-            text = f"{r.joint}: no model explains {percent(1 - r.explained)} of its effort ({r.source})"
-            out.append(warn(f"{text} ({r.mend})" if r.mend else text))
-        if r.lag and r not in bad:
-            text = f"{r.joint}: its motion follows the effort ({r.source}) {r.lag * 1e3:+.0f} ms late"
-            physical = OF_EFFORT.causal[0] <= r.lag <= OF_EFFORT.causal[1]
-            out.append(Finding("finding", text) if physical else warn(f"{text}: do the clocks agree?"))
-    return out
-
-
-def _unrelated(r: Relation) -> str:
-    assert r.explained is not None
-    share = min(1.0, 1.0 - r.explained)
-    text = (
-        f"effort unrelated to motion: {percent(share)} of the effort of {r.joint} ({r.source}) unexplained by any model"
-    )
-    if r.explained >= 0.3:
-        text += f", and friction alone explains {percent(r.friction)}"
-    why = r.mend or "column not aligned in time, wrong scale, or forces that were not logged?"
-    return f"{text} ({why})"

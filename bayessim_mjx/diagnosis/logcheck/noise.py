@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import itertools
-import warnings
 from collections.abc import Sequence
 from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
+from bayessim_mjx.diagnosis.logcheck.single_log import LIMITS
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.signals import LEVELS, noise_level, values_shown
 
 Array = NDArray[np.float64]
-MOVING = 20  # rows in which a position changes: with fewer nothing tells whether it shows noise
-PRECISE = 5e-7  # s: times a joint's speed, as precise as positions are taken to be that show no noise (a simulation's)
+# s, times a joint's speed: the least noise of a position. Only logs of a simulation show less. Rule of thumb.
+PRECISE = 5e-7
 ONCE = "no run was repeated: these logs do not separate chance from an error of the model"
 
 
@@ -53,30 +54,16 @@ def repeats(logs: Sequence[Log]) -> list[list[Log]]:
     other = [log.name for log in logs if log.channels != logs[0].channels]
     if other:
         raise UserError(f"{other[0]!r} has other channels than {logs[0].name!r}; allowed: logs of one robot")
-    parent = list(range(len(logs)))
-
-    def root(i: int) -> int:
-        while parent[i] != i:
-            i = parent[i]
-        return i
-
     names = {alias: i for i, log in enumerate(logs) for alias in log.aliases}
+    same = np.zeros((len(logs), len(logs)), bool)
     for i, log in enumerate(logs):
-        target = log.metadata.get("repeat_of")
-        if target is None:
-            continue
-        if str(target) not in names:
-            text = f"{log.name}: repeat_of = {target!r} is none of the logs; allowed: a file's name; it is left alone"
-            warnings.warn(text, stacklevel=2)
-        else:
-            parent[root(i)] = root(names[str(target)])
-    for (i, a), (j, b) in itertools.combinations(enumerate(logs), 2):
-        if root(i) != root(j) and _same(a, b):
-            parent[root(i)] = root(j)
-    groups: dict[int, list[Log]] = {}
-    for i, log in enumerate(logs):
-        groups.setdefault(root(i), []).append(log)
-    return [g for g in groups.values() if len(g) > 1]
+        declared = names.get(str(log.metadata.get("repeat_of")))
+        same[i, i if declared is None else declared] = True
+    for (i, one), (j, other_one) in itertools.combinations(enumerate(logs), 2):
+        same[i, j] |= _same(one, other_one)
+    count, group = connected_components(same, directed=False) if logs else (0, [])
+    found = [[log for log, own in zip(logs, group, strict=True) if own == k] for k in range(count)]
+    return [runs for runs in found if len(runs) > 1]
 
 
 def _same(a: Log, b: Log) -> bool:
@@ -103,10 +90,10 @@ def noise_free(logs: Sequence[Log], column: int) -> bool:
 
 def _smooth(x: Array) -> float | None:
     """Level of the eighth differences of x [T] in that of the fourth ones, where x moves; None: it hardly does."""
-    if len(x) <= MOVING + 8:
+    if len(x) <= LIMITS.min_rows + 8:
         return None
     changing = np.asarray(np.lib.stride_tricks.sliding_window_view(np.diff(x) != 0, 8).any(1))
-    if changing.sum() < MOVING:
+    if changing.sum() < LIMITS.min_rows:
         return None
     return _level(x, 8, changing) / max(_level(x, 4, changing), 1e-300)
 
@@ -128,21 +115,18 @@ def noise_of(logs: Sequence[Log], raw: Sequence[Log], use_qvel: bool) -> tuple[A
     rate, moved = _pooled([log.sigma_qvel for log in logs], [noise_known(log, "qvel") for log in raw])
     motion = np.sqrt(np.mean([np.mean(log.qvel**2, axis=0) for log in logs], axis=0))
     known, precise = np.isfinite(dofs), np.maximum(PRECISE * motion, 1e-14)
-    sigma_q = np.maximum(dofs, precise)
-    sigma_v = np.where(moved & use_qvel, np.maximum(rate, 1e-3 * motion), np.inf)
-    # where nothing tells the noise, a start is as uncertain as the usual sensor of this robot leaves it
-    start_q = np.where(known, sigma_q, np.median(sigma_q[known]) if known.any() else 1.0)
-    start_v = np.maximum(3 * rate, 0.1 * motion + 10 * start_q)
-    if not (np.isfinite(sigma_q) | np.isfinite(sigma_v)).any():
+    if not (known | moved & use_qvel).any():
         text = f"{raw[0].name}: no position shows {LEVELS} values in any log, so nothing tells the noise of the sensors"
         raise UserError(f"{text}; allowed: `quantum` or `sigma` in the logs' side YAML, or logs that move")
-    if not any(log.absent for log in logs):
-        return sigma_q, sigma_v, np.concatenate([3 * start_q, start_v])
     seen, fast = (np.all([getattr(log, k) for log in logs], axis=0) for k in ("seen_dofs", "seen_speeds"))
+    fast |= not any(log.absent for log in logs)
     kept = fast & moved & (use_qvel | ~seen)  # the only measurement of a joint is compared in any case
-    sigma_v = np.where(kept, np.maximum(rate, 1e-3 * motion), np.inf)
+    sigma_q, sigma_v = np.maximum(dofs, precise), np.where(kept, np.maximum(rate, 1e-3 * motion), np.inf)
+    # where nothing tells the noise, a start is as uncertain as the usual sensor of this robot leaves it
+    usual = np.where(known, sigma_q, np.median(sigma_q[known]) if known.any() else 1.0)
+    start_v = np.maximum(3 * rate, 0.1 * motion + 10 * usual)
     guess = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
-    start_q = np.where(seen, start_q, np.maximum(guess, precise))
+    start_q = np.where(seen, usual, np.maximum(guess, precise))
     start_v = np.where(seen, start_v, 3 * rate + 0.1 * motion)  # what is guessed is not tied to its position's guess
     return np.where(seen, sigma_q, np.inf), sigma_v, np.concatenate([3 * start_q, start_v])
 

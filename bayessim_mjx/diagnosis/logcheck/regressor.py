@@ -19,10 +19,11 @@ from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import bandwidth, lowpass
 
 Mask = NDArray[np.bool_]
-# Rules of thumb, not counted.
-SLOW = 0.02  # of a joint's top speed, at which dry friction turns over
-TILT = 0.3  # rad, by which a base may be tilted
-FEWEST = 6.0  # independent rows, below which no effort is compared with a motion
+SLOW = 0.02  # of a joint's top speed, at which dry friction turns over; rule of thumb, not measured
+TILT = 0.3  # rad, by which a base may be tilted at most; rule of thumb, not measured
+# Independent rows, below which no effort is compared with a motion. Source: as many columns of the effort's model have
+# no upper bound (`effort`), so fewer rows would be explained whatever they hold.
+FEWEST = 6.0
 
 
 @dataclass(frozen=True, eq=False)

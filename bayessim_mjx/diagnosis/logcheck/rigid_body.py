@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-INERTIAL = 10
-BLOCK = 2000  # rows at a time
+INERTIAL = 10  # parameters of a body: mass, first moments (3) and inertia (6), as Atkeson et al. count them
+BLOCK = 2000  # rows at a time: the memory that they take; results differ by rounding alone
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 

@@ -243,7 +243,7 @@ class Closed:
 
         (left, said), (left_without, said_without) = both(every), both(rows)
         counting = [np.maximum(left - left_without, 0.0)[:, None], np.maximum(said - said_without, 0.0).T]
-        freedom = np.minimum(*(statistics.freedom(own, statistics.LEVELS.ruled) for own in counting))
+        freedom = np.minimum(*(statistics.freedom(own, statistics.RULED) for own in counting))
         error = statistics.error(np.log(left_without / said_without).T)
         allowed = statistics.quantile(freedom) * np.hypot(error, off * shares[:, 0] * noise / said[:, 0])
         far = np.log(left / said)

@@ -14,11 +14,11 @@ import yaml
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.importers.streams import Recording
 from bayessim_mjx.logs.log import Array, Channels, suggest
+from bayessim_mjx.logs.units import TURN
 
 HEAD = """# How the columns of the files beside it become channels of the model (docs/logs.md).
 # Measured signals were interpolated linearly onto the times of the positions, commands averaged over each row.
 """
-QUARTERS = 12.6  # rad, two turns: positions beyond are hardly in rad
 
 
 @dataclass
@@ -66,7 +66,7 @@ class Target:
     def _doubt(self, name: str, columns: Mapping[str, Array]) -> None:
         positions = [c for k, c in columns.items() if k.startswith("position:")]
         largest = max((float(np.nanmax(np.abs(c))) for c in positions if np.isfinite(c).any()), default=0.0)
-        if largest * self.scale > QUARTERS and not any("--scale" in note for note in self.notes):
+        if largest * self.scale > 2.0 * TURN and not any("--scale" in note for note in self.notes):
             self.notes.append(f"{name}: positions reach {largest:.3g}: degrees would need --scale 0.017453293")
 
     def _map(self, columns: Sequence[str]) -> dict[str, Any]:

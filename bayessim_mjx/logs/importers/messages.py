@@ -14,7 +14,7 @@ STATE, IMU, CONTROLLER = "JointState", "Imu", "JointTrajectoryControllerState"
 COMMANDS = ("Float64MultiArray", "Float64", "JointTrajectory")
 KINDS = (STATE, IMU, CONTROLLER, *COMMANDS)
 FIELDS = ("position", "velocity", "effort")
-FAR = 1_000_000_000  # ns between stamp and receipt: two clocks
+FAR = 1_000_000_000  # ns between stamp and receipt: two clocks; rule of thumb, not measured
 Kind = Literal["measured", "held", "linear"]
 
 

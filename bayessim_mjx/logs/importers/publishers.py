@@ -14,10 +14,11 @@ from bayessim_mjx.logs.importers.messages import FIELDS, Message
 from bayessim_mjx.logs.log import Array
 from bayessim_mjx.logs.signals import quantum
 
+# Rules of thumb, not measured.
 LEAST = 5e-3  # rad or m, apart from which two values are two
-COUNTS = 20.0  # steps of an encoder, within which a value may flicker
-STEPS = 8.0  # usual steps from sample to sample, beyond which a value belongs to no smooth motion
-FEW = 5  # values off the motion from which another publisher is behind them
+COUNTS = 20.0  # steps of an encoder, within which a value may flicker; rule of thumb
+STEPS = 8.0  # usual steps from sample to sample, beyond which a value is off a smooth motion; rule of thumb
+FEW = 5  # values off the motion from which another publisher is behind them; rule of thumb
 
 
 @dataclass(frozen=True)

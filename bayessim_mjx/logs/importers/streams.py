@@ -11,8 +11,7 @@ import numpy as np
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.commands import integrals
 from bayessim_mjx.logs.log import Array
-
-MAX_GAP = 5.0  # periods of a stream without a sample, across which nothing is interpolated
+from bayessim_mjx.logs.pieces import MAX_GAP
 
 
 @dataclass(frozen=True)

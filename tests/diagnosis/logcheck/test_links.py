@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.logcheck.gate import check
-from bayessim_mjx.diagnosis.logcheck.links import Link, compare, links, offset
+from bayessim_mjx.diagnosis.logcheck.links import Link, links
+from bayessim_mjx.diagnosis.logcheck.timing import compare, offset
 from bayessim_mjx.logs import Log, read_logs
 from tests.diagnosis.recordings import ARM, PENDULUM, record, sines
 

@@ -6,7 +6,7 @@ import pytest
 
 from bayessim_mjx import effects
 from bayessim_mjx.diagnosis.fitting import robot, scales
-from bayessim_mjx.diagnosis.logcheck import loads
+from bayessim_mjx.diagnosis.logcheck import drives
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.search_state import ranked
 from bayessim_mjx.diagnosis.setup import prepare
@@ -32,14 +32,14 @@ def compiled(limits=LIMITS, load="", step=0.002, integrator="Euler"):
 
 def test_the_drives_hold_so_much_by_hand():
     """Stretched out level: m g lever = limit + own gravity torque, at the joint that gives way first."""
-    held = loads.carried(compiled(), np.zeros((1, 2)))
+    held = drives.carried(compiled(), np.zeros((1, 2)))
     own = (6 * 0.3 + 3 * 0.85 + 0.2 * 1.1, 3 * 0.25 + 0.2 * 0.5)  # kg m beyond shoulder and elbow
     ruled = ((150 / G + own[0]) / 1.1, (40 / G + own[1]) / 0.5)
     assert held[3] == pytest.approx(min(9.2, *ruled), rel=1e-9) and held[3] == pytest.approx(9.2)  # all that moves
-    weak = loads.carried(compiled(('actuatorfrcrange="-20 20"', LIMITS[1])), np.zeros((1, 2)))
+    weak = drives.carried(compiled(('actuatorfrcrange="-20 20"', LIMITS[1])), np.zeros((1, 2)))
     assert weak[3] == pytest.approx((20 / G + own[0]) / 1.1, rel=1e-9)
     assert weak[1] > weak[3]  # nearer to the joint
-    hanging = loads.carried(compiled(('actuatorfrcrange="-20 20"', LIMITS[1])), np.array([[np.pi / 2, 0.0]]))
+    hanging = drives.carried(compiled(('actuatorfrcrange="-20 20"', LIMITS[1])), np.array([[np.pi / 2, 0.0]]))
     assert hanging[3] == pytest.approx(9.2)  # no lever
 
 
@@ -47,8 +47,8 @@ def test_limits_of_force_and_command_count_through_the_gear():
     xml = ARM % (0.002, "Euler", "", "", "")
     xml = xml.replace('joint="shoulder"', 'joint="shoulder" ctrlrange="-7 9" ctrllimited="true"')
     xml = xml.replace('gear="2"', 'gear="-2" forcerange="-5 4" forcelimited="true"')
-    assert loads.force_limits(mujoco.MjModel.from_xml_string(xml)).tolist() == [9.0, 10.0]
-    assert np.isinf(loads.force_limits(compiled(("", "")))).all()
+    assert drives.force_limits(mujoco.MjModel.from_xml_string(xml)).tolist() == [9.0, 10.0]
+    assert np.isinf(drives.force_limits(compiled(("", "")))).all()
 
 
 def test_a_light_flange_may_carry_what_the_arm_can():

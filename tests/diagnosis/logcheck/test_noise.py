@@ -15,11 +15,12 @@ def test_runs_of_the_same_commands_are_one_group() -> None:
     assert [[log.name for log in group] for group in repeats(runs)] == [["0.npz", "1.npz", "2.npz", "3.npz"]]
 
 
-def test_a_declared_repeat_of_nobody_is_left_alone() -> None:
+def test_a_repeat_is_what_is_declared_and_of_nobody_none() -> None:
     log = record(PENDULUM, sines((1.0,)))
     assert repeats([log]) == []
-    with pytest.warns(UserWarning, match="repeat_of = 'nobody'"):
-        assert repeats([dataclasses.replace(log, metadata={"repeat_of": "nobody"})]) == []
+    assert repeats([dataclasses.replace(log, metadata={"repeat_of": "nobody"})]) == []
+    again = dataclasses.replace(log, name="again", ctrl=log.ctrl + 1.0, metadata={"repeat_of": log.name})
+    assert repeats([log, again]) == [[log, again]]
 
 
 def test_logs_of_different_robots_are_refused() -> None:

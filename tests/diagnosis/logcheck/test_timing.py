@@ -17,17 +17,16 @@ def test_motion_follows_held_commands_half_a_row_later_and_a_delay_beside(delay:
     timing = check(logs, model, PERIOD).timing
     motion = timing.motion["hinge"]
     assert motion.seconds == pytest.approx(PERIOD / 2 + delay, abs=4 * motion.error) and 0 < motion.error < 2e-3
-    assert timing.period == pytest.approx(PERIOD) and timing.control == PERIOD and timing.commands is None
     assert timing.velocities["hinge"].seconds == pytest.approx(0.0, abs=1e-3)
 
 
 def test_commands_are_moved_once_and_said() -> None:
     log = record(PENDULUM, sines((1.5,)))
     gate = check([log], mujoco.MjModel.from_xml_string(PENDULUM), PERIOD)
-    led = gate.clocked(Late(-0.003, 1e-4), -0.003)
+    led = gate.moved(-0.003)
     assert led.usable[0].late == pytest.approx(-0.003) and led.timing.moved == -0.003
-    kept = gate.clocked(Late(0.004, 1e-4), 0.0)
-    assert kept.usable == gate.usable and kept.timing.commands == Late(0.004, 1e-4) and kept.timing.moved == 0.0
+    kept = gate.moved(0.0)
+    assert kept.usable == gate.usable and kept.timing.moved == 0.0
 
 
 def test_a_lateness_within_four_errors_is_none() -> None:
