@@ -143,8 +143,8 @@ def scripts_flags(page: Path) -> set[str]:
 
 
 def test_all_tasks_and_rooms_are_told_of():
-    tasks, rooms = (ROOT / "docs" / "commands.md").read_text(), (ROOT / "docs" / "architecture.md").read_text()
-    assert [name for name in registry.names() if f"| {name} |" not in tasks] == []
+    tasks, rooms = (ROOT / "docs" / "tasks.md").read_text(), (ROOT / "docs" / "architecture.md").read_text()
+    assert [name for name in registry.names() if f"| **{name}**: " not in tasks] == []
     packages = [p.parent for p in (ROOT / "bayessim_mjx").rglob("__init__.py")]
     own = {p.name for p in packages if p.parent in (ROOT / "bayessim_mjx", ROOT / "bayessim_mjx" / "diagnosis")}
     assert {name for name in own - {"tasks"} if f"{name}/" not in rooms} == set()
@@ -156,6 +156,20 @@ def test_every_page_is_in_the_menu_of_the_site_and_every_public_name_in_its_api(
     assert [name for name in pages if f" {name}\n" not in menu] == []
     shown = set(re.findall(r"^::: .*\.(\w+)$", "".join(p.read_text() for p in (ROOT / "docs/api").glob("*.md")), re.M))
     assert set(bayessim_mjx.__all__) <= shown
+
+
+@functools.cache
+def spoken() -> str:
+    """The source of the package, with texts that continue on the next line as one."""
+    files = sorted((ROOT / "bayessim_mjx").rglob("*.py"))
+    return re.sub(r"[\"']\s*\n\s*f?[\"']", "", "".join(f.read_text(encoding="utf-8") for f in files))
+
+
+def test_sentences_of_the_console_are_those_of_the_package():
+    rows = re.findall(r"^\| `([^`|]+)`", (ROOT / "docs" / "troubleshooting.md").read_text(), re.MULTILINE)
+    parts = [part.strip() for row in rows for part in re.split(r"…|[A-Z]{4,}|\d[\d.]*", row)]
+    long = [part for part in parts if len(part) > 12]
+    assert len(long) > 20 and [part for part in long if part not in spoken()] == []
 
 
 def test_a_film_of_every_task_says_what_it_shows():
@@ -203,6 +217,8 @@ def test_the_how_to_of_an_own_robot_finds_its_hidden_friction(tmp_path, monkeypa
     written = {path.name for path in (tmp_path / "found").iterdir()}
     assert {"diagnosis.json", "details.json", "effects.yaml", "model_with_effects.xml"} <= written
     assert "preliminary.json" not in written
+    arm = page.Arm()  # the task of the same model, with what was found
+    assert arm.mj_model.nu == 1 and arm.physics.space.names == ()
 
 
 @pytest.mark.slow
