@@ -12,8 +12,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-from mkdocs.structure.files import File
-
 ROOT = Path(__file__).resolve().parents[1]
 ELSEWHERE = ("CONTRIBUTING.md", "CHANGELOG.md", *(f"benchmarks/{p.name}" for p in (ROOT / "benchmarks").glob("*.md")))
 PLOTLY = "pictures/plotly.min.js"  # the sample report asks for it; from the installed package, so that no copy is kept
@@ -29,6 +27,8 @@ CODE = re.compile(r"(```.*?```|`[^`\n]*`)", re.DOTALL)
 
 def on_files(files: Any, config: Any) -> Any:
     """Add the pages of the repository's top and of benchmarks/, and what the sample report draws with."""
+    from mkdocs.structure.files import File
+
     for name in ELSEWHERE:
         files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
     plotly = importlib.util.find_spec("plotly")

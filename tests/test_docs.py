@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import importlib.util
 import io
 import json
 import re
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 import bayessim_mjx
-from bayessim_mjx import diagnosis, main, registry, rl
+from bayessim_mjx import diagnosis, effects, main, registry, rl
 from bayessim_mjx.cli import ancestors
 from bayessim_mjx.config import settings
 
@@ -158,6 +159,24 @@ def test_every_page_is_in_the_menu_of_the_site_and_every_public_name_in_its_api(
     assert set(bayessim_mjx.__all__) <= shown
 
 
+def test_the_site_makes_tables_of_all_settings_and_effects():
+    named = importlib.util.spec_from_file_location("site_hooks", ROOT / "docs" / "site_hooks.py")
+    hooks = importlib.util.module_from_spec(named)
+    named.loader.exec_module(hooks)
+    pages = "".join(page.read_text() for page in PAGES)
+    for thing in vars(settings).values():
+        section = dataclasses.is_dataclass(thing) and getattr(thing, "SECTION", "")
+        if section:
+            keys = [
+                field.name
+                for field in dataclasses.fields(thing)
+                if not field.metadata["doc"].startswith("settings of this")
+            ]
+            assert re.findall(r"^\| `(\w+)` \|", hooks.table(section), re.M) == keys
+            assert f"<!-- table: {section} -->\n" in pages
+    assert set(re.findall(r"^\| `(\w+)` \|", hooks.table("effects"), re.M)) == set(effects.names())
+
+
 @functools.cache
 def spoken() -> str:
     """The source of the package, with texts that continue on the next line as one."""
@@ -190,7 +209,7 @@ def test_code_is_python(page):
 
 @pytest.mark.slow
 @pytest.mark.ci
-@pytest.mark.parametrize("name", ["own_effect", "own_task", "own_walker"])
+@pytest.mark.parametrize("name", ["own_effect", "own_task"])
 def test_code_of_a_how_to_runs(name, tmp_path, monkeypatch):
     """Where it trains, shortly: other tests are about learning."""
     monkeypatch.chdir(tmp_path)
