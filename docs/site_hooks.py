@@ -19,7 +19,8 @@ NAMED = re.compile(r"\[([\w./-]+\.md)\](\(([^)\s#:]+\.md)(?:#[^)\s]*)?\))")  # a
 FRAME = '<iframe class="report" src="../pictures/report.html" title="report of a diagnosis"></iframe>'
 SETTINGS = ROOT / "bayessim_mjx" / "config" / "settings.py"
 EFFECTS = ROOT / "bayessim_mjx" / "effects"
-TABLE = re.compile(r"^<!-- table: ([\w.]+) -->$", re.MULTILINE)  # effects, or a section of the settings
+PARTS = ROOT / "tasks" / "_parts.py"
+TABLE = re.compile(r"^<!-- table: ([\w.]+) -->$", re.MULTILINE)  # see `table`
 SPECIAL = re.compile(r"[|*_]")  # what Markdown would take for its own
 LINK = re.compile(r"(\]\()([^)\s#:]+)((?:#[^)\s]*)?\))")
 CODE = re.compile(r"(```.*?```|`[^`\n]*`)", re.DOTALL)
@@ -39,10 +40,12 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def table(name: str) -> str:
-    """The Markdown table of a section of the settings, or of all effects."""
+    """The Markdown table of a section of the settings, of all effects, or of the parts of walking robots."""
     if name == "effects":
         head = ["effect", "place", "law", "parameters"]
         rows = [row for file in sorted(EFFECTS.glob("*.py")) for row in _effects(file)]
+    elif name == "locomotion":
+        head, rows = ["in", "name", "value"], _parts()
     else:
         head, rows = ["key", "default", "meaning"], _settings(name)
     assert rows, f"<!-- table: {name} -->: there is no such table"
@@ -86,6 +89,20 @@ def _effects(file: Path) -> list[list[str]]:
             stated = re.search(r"Parameters: (.*?)[.;]", text, re.DOTALL)  # where a function makes them
             words = ", ".join(each) or (stated[1].replace("\n", " ") if stated else "")
             found.append([f"`{name or file.stem}`", str(kind), law, words])
+    return found
+
+
+def _parts() -> list[list[str]]:
+    """[observations or rewards, name, value] of the blocks and parts that walking robots have."""
+    [owner] = [
+        node for node in ast.parse(PARTS.read_text(encoding="utf-8")).body if getattr(node, "name", "") == "Parts"
+    ]
+    found = []
+    for node in owner.body:
+        kind, _, name = getattr(node, "name", "").partition("_")
+        if isinstance(node, ast.FunctionDef) and kind in ("observe", "reward") and name:
+            text = (ast.get_docstring(node) or "").partition("\n\n")[0].replace("\n", " ")
+            found.append([{"observe": "observations", "reward": "rewards"}[kind], f"`{name}`", text])
     return found
 
 

@@ -18,6 +18,7 @@ import bayessim_mjx
 from bayessim_mjx import diagnosis, effects, main, registry, rl
 from bayessim_mjx.cli import ancestors
 from bayessim_mjx.config import settings
+from bayessim_mjx.tasks.locomotion import Locomotion
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = ("main", "train", "play", "calibrate", "diagnose", "blind", "gap_loop", "logs", "implementations")
@@ -175,6 +176,9 @@ def test_the_site_makes_tables_of_all_settings_and_effects():
             assert re.findall(r"^\| `(\w+)` \|", hooks.table(section), re.M) == keys
             assert f"<!-- table: {section} -->\n" in pages
     assert set(re.findall(r"^\| `(\w+)` \|", hooks.table("effects"), re.M)) == set(effects.names())
+    parts = re.findall(r"^\| (observ|reward)\w+ \| `(\w+)` \| \w", hooks.table("locomotion"), re.M)
+    own = [re.match("(observ|reward)e?_(.*)", name) for name in dir(Locomotion)]
+    assert set(parts) == {found.groups() for found in own if found} and len(parts) > 20
 
 
 @functools.cache
