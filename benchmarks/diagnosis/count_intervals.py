@@ -1,11 +1,12 @@
 """Do 90 % intervals hold where a data sheet is less accurate than assumed, and on few or poor logs?
 
     python benchmarks/diagnosis/count_intervals.py run OUT --jobs 64 --minutes 9 [--only sheets] [--shard 0/2]
-    python benchmarks/diagnosis/count_intervals.py isolable OUT --jobs 64 --minutes 9   # of what has a result
+    python benchmarks/diagnosis/count_intervals.py isolable OUT --jobs 64 --minutes 9   # needs no result
+    python benchmarks/diagnosis/count_intervals.py isolable OUT --case pendulum_single_s9300
     python benchmarks/diagnosis/count_intervals.py score OUT [--before OTHER]
 
-`counted_cases.py` fixes the cases: 150 of data sheets, 60 of poor logs, 90 outside the library. Rules, fixed before
-any case was diagnosed:
+`counted_cases.py` fixes the cases: 150 of data sheets, 60 of poor logs, 90 outside the library, and 60 in each of two
+other realities. Rules, fixed before any case was diagnosed:
 
 - **Command.** `diagnose --model --data --seed 0 --verdict_only`: nothing is said of the data sheet's accuracy, all
   effects are on offer, no time limit of the search. Another commit is measured with PYTHONPATH set to its checkout,
@@ -21,7 +22,8 @@ any case was diagnosed:
   The size of a set is the number of its effect@place, mean over the answers that name something.
 - **Isolable** is a case if, by its truth alone, every other cause of the generator leaves something of each hidden
   effect, and known parameters do that are free within 90 % of their nominal values (`lookalikes.py`; no accuracy is
-  stated). An effect that is a known parameter by another name (viscous friction, armature) never is.
+  stated). An effect that is a known parameter by another name (viscous friction, armature) never is. One process
+  examines one case; OUT/CASE/isolable.json keeps what it found.
 - **Strengths.** Parameters of rightly named effects, where they mean the same in reality and library (not those of base
   flexibility, external force and load friction). An interval is mean +- 1.645 sd. A parameter at a bound or without sd
   is a miss, unless it says "at least" or "at most" and that holds.
@@ -30,7 +32,8 @@ any case was diagnosed:
 - **Closed share.** `gap.closed.ci` against what the same model closes on fresh motions of the same runs (`fresh.py`).
   Answers that name effects but state no interval (one condition) are counted apart.
 - **Outside.** Of a null an alarm is an effect that is named, or "unexplained"; a cause that the library does not have
-  is found if the verdict is "unexplained".
+  is found if the verdict is "unexplained"; it is taken for an effect if the verdict names one.
+- **Realities.** A table of its own has one row for each. All other tables are of the cases that MuJoCo C simulates.
 - **Stated probabilities.** That of the answer (`evidence` of diagnosis.json), against whether it is the hidden set
   (nothing, of a null), what is one with it (`hidden`, `same_as`) included; unknown causes left out. Brier score, and
   bins of a fifth.
@@ -54,6 +57,7 @@ RESULT, PLAN, RIVALS = "result.json", "plan.json", "isolable.json"
 # CPU seconds of one single with an empty compilation cache (machine C; the servo arm's was not ended), for the order
 # alone; a double is taken to last twice as long
 SECONDS = {"pendulum": 67, "cartpole": 109, "two_link": 141, "leg": 187, "arm_servo": 450, "arm_torque": 282}
+REALITIES = ("mujoco", "own laws", "own integrator")
 DONE, ONE = {"run": RESULT, "isolable": RIVALS}, {"run": "one", "isolable": "rivals"}
 THREADS = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
 ALONE = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
@@ -88,10 +92,12 @@ def one(folder: Path, more: list[str]) -> None:
 
 
 def rivals(folder: Path) -> None:
-    """Which other causes explain the same motion as the hidden effects of a case with a result."""
+    """Which other causes explain the same motion as the hidden effects of a case."""
     from counted_cases import rivals_of
 
-    truth = json.loads((folder / RESULT).read_text())["truth"]
+    truth = None
+    if (folder / RESULT).exists():
+        truth = json.loads((folder / RESULT).read_text()).get("truth")
     _write(folder / RIVALS, rivals_of(_plan_of(folder), truth))
 
 
@@ -117,10 +123,12 @@ def _write(path: Path, content: Any) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """All cases without a result, longest first, until the minutes are over."""
-    waiting, running = _waiting(args), dict[int, tuple[Any, Path, float]]()
+    waiting, running = _waiting(args), dict[int | None, tuple[Any, Path, float]]()
     until = time.monotonic() + 60 * args.minutes
     usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-    free = usable[: args.jobs]
+    free: list[int | None] = [*usable[: args.jobs]]
+    if args.case:  # somebody else shares the cores among such commands
+        free = [None]
     print(f"{len(waiting)} cases, {len(free)} at once, {args.minutes:g} minutes", flush=True)
     try:
         while (waiting or running) and time.monotonic() < until:
@@ -145,8 +153,9 @@ def _waiting(args: argparse.Namespace) -> list[Path]:
     index, count = (int(n) for n in args.shard.split("/"))
     chosen = [*frozen()] if args.only == "frozen" else [p for p in plans() if args.only in ("all", p.group)]
     chosen = [p for p in chosen if p.system in args.systems.split(",")] if args.systems else chosen
+    chosen = [p for p in chosen if args.reality in ("all", p.reality) and args.case in ("", p.name)]
     if args.does == "isolable":
-        chosen = [p for p in chosen if p.group != "outside" and (args.out / p.name / RESULT).exists()]
+        chosen = [p for p in chosen if p.group != "outside"]
     chosen = sorted(chosen, key=lambda p: (-SECONDS[p.system] * max(len(p.effects), 1), p.seed, p.name))[index::count]
     folders = []
     for plan in chosen:
@@ -157,10 +166,11 @@ def _waiting(args: argparse.Namespace) -> list[Path]:
     return folders
 
 
-def _begin(folder: Path, core: int, args: argparse.Namespace) -> "subprocess.Popen[bytes]":
+def _begin(folder: Path, core: int | None, args: argparse.Namespace) -> "subprocess.Popen[bytes]":
     flags = f"{os.environ.get('XLA_FLAGS', '')} {ALONE}".strip()
     alone = {"JAX_PLATFORMS": args.platforms, "XLA_FLAGS": flags, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | THREADS
-    command = [sys.executable, __file__, ONE[args.does], str(folder), "--core", str(core), f"--more={args.more}"]
+    command = [sys.executable, __file__, ONE[args.does], str(folder), f"--more={args.more}"]
+    command += [] if core is None else ["--core", str(core)]
     with (folder / ("output.txt" if args.does == "run" else "rivals.txt")).open("w") as text:
         return subprocess.Popen(
             command, stdout=text, stderr=subprocess.STDOUT, env=os.environ | alone, start_new_session=True
@@ -192,6 +202,8 @@ def _parser() -> argparse.ArgumentParser:
         several.add_argument("--minutes", type=float, default=1e6, help="when they are over, running cases are killed")
         several.add_argument("--only", choices=("all", "sheets", "logs", "outside", "frozen"), default="all")
         several.add_argument("--systems", default="", help="some robots, separated by commas; default all")
+        several.add_argument("--reality", choices=("all", *REALITIES), default="all", help="what simulates the cases")
+        several.add_argument("--case", default="", help="one case by its name, on any core")
         several.add_argument("--platforms", default="cpu", help="JAX's; 'cuda,cpu': all cases share a GPU")
         several.add_argument("--shard", default="0/1", help="i/n: every n-th case, from the i-th")
         several.add_argument("--more", default="", help="further options of the command, as --more='--accuracy 5%%'")

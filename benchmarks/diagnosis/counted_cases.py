@@ -21,8 +21,19 @@ does not have (`KINDS`' unknown), seeds 9600 to 9604; the scale is drawn as abov
 
 Velocities are logged in half of the others.
 
-**Frozen** (60 of these cases): of each robot the first three singles and doubles of data sheets, two poor logs, one
-null and one unknown cause. `frozen.json` has what a commit said of those that ended (`frozen.py`).
+**Other realities** (60 cases each; the cases above are simulated by MuJoCo C at a tenth of the model's step). Of each
+robot three singles and three doubles, two nulls and two unknown causes; strengths, scales and all else as for data
+sheets. Fixed before any was simulated:
+
+- own laws, seeds 9700 to 9702 (nulls and unknown causes 9700 and 9701): MuJoCo C with `own_laws.py` in place of seven
+  causes' laws. These seven take turns in the singles, and as the first of two in the doubles, where they take that of
+  the seed three turns later. The second is of all effects, as it is drawn for data sheets: the first of its pair that
+  is another effect, and not a second body behind the same rotor.
+- own integrator, seeds 9800 to 9802 (9800 and 9801): equations of motion and Runge-Kutta steps of .1 ms that are not
+  MuJoCo's (`own_motion.py`), effects in turn as for data sheets. Strengths are those that MuJoCo C measures.
+
+**Frozen** (60 of the cases of MuJoCo C): of each robot the first three singles and doubles of data sheets, two poor
+logs, one null and one unknown cause. `frozen.json` has what a commit said of those that ended (`frozen.py`).
 """
 
 import dataclasses
@@ -30,11 +41,12 @@ import functools
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import own_laws
 from cases import KNOWN, STRENGTHS, SYSTEMS, draw_cause, places, write
 from isolable import KINDS, seed_of
 from turns import jobs
@@ -56,6 +68,9 @@ FREE = 0.9  # of their nominal values, within which they are free where rivals a
 
 OUTSIDE = {"null": range(9600, 9610), "unknown": range(9600, 9605)}
 
+OTHERS = {"own laws": 9700, "own integrator": 9800}  # first seeds
+EACH = {"single": 3, "double": 3, "null": 2, "unknown": 2}  # of each robot in each of them
+
 FROZEN = {"single": 3, "double": 3, "logs": 2, "null": 1, "unknown": 1}  # of each robot, the first of each
 
 POOR = ("held joint", "one log", "two logs", "position-only", "quantised", "late velocities")
@@ -71,7 +86,10 @@ LATE = 0.02  # s
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """One case before anything of it is simulated; logs: "all", or one of POOR; scale: of its parameters' errors."""
+    """One case before anything of it is simulated.
+
+    logs: "all", or one of POOR; scale: of its parameters' errors; reality: "mujoco", or one of OTHERS.
+    """
 
     name: str
     logs: str
@@ -81,6 +99,7 @@ class Plan:
     strength: str
     seed: int
     scale: float
+    reality: str = "mujoco"
 
     @property
     def group(self) -> str:
@@ -104,7 +123,16 @@ def plans() -> tuple[Plan, ...]:
             found.append(Plan(name, own[seed], kind, system, effects, strength, seed, STATED))
     for system, (kind, seeds) in itertools.product(SEEDS, OUTSIDE.items()):
         found += [_drawn_sheet(*job) for job in jobs(Path(), seeds, [kind], [system], [*STRENGTHS][1:3])]
-    return tuple(found)
+    return (*found, *_in_other_realities())
+
+
+def _in_other_realities() -> Iterator[Plan]:
+    for (reality, first), system, (kind, count) in itertools.product(OTHERS.items(), SEEDS, EACH.items()):
+        for job in jobs(Path(), range(first, first + count), [kind], [system], [*STRENGTHS][1:3]):
+            plan = dataclasses.replace(_drawn_sheet(*job), reality=reality)
+            if reality == "own laws":
+                plan = dataclasses.replace(plan, effects=own_laws.turn(kind, system, plan.seed, plan.effects))
+            yield plan
 
 
 @functools.cache
@@ -112,7 +140,7 @@ def frozen() -> tuple[Plan, ...]:
     """The cases that every change of the diagnosis is held against."""
     taken: Counter[tuple[str, str]] = Counter()
     found = []
-    for plan in plans():
+    for plan in (p for p in plans() if p.reality == "mujoco"):
         kind = plan.system, "logs" if plan.group == "logs" else plan.kind
         taken[kind] += 1
         found += [plan] if taken[kind] <= FROZEN[kind[1]] else []
@@ -175,9 +203,14 @@ class Drawn:
     causes: list[Cause]
     ruler: Ruler
     rng: np.random.Generator
+    reality: str
 
     def plant(self) -> Plant:
-        return Plant(self.robot, self.base, self.causes)
+        if self.reality != "own integrator":
+            return Plant(self.robot, self.base, self.causes)
+        from own_plant import OwnPlant  # JAX, which the other realities do without
+
+        return OwnPlant(self.robot, self.base, self.causes)
 
 
 def errors(plan: Plan, names: Sequence[str], rng: np.random.Generator) -> dict[str, float]:
@@ -195,18 +228,24 @@ def drawn(plan: Plan) -> Drawn:
     for name in plan.effects:
         open_to = [w for w in places(robot, name, scales) if scales.drives.get(w, w) != still]
         effect = (name, str(rng.choice(open_to))) if still else name
-        causes.append(draw_cause(effect, robot, scales, causes, rng))
-    return Drawn(robot, base, causes, ruler, rng)
+        cause = draw_cause(effect, robot, scales, causes, rng)
+        causes.append(own_laws.lawful(cause) if plan.reality == "own laws" else cause)
+    return Drawn(robot, base, causes, ruler, rng, plan.reality)
 
 
-def make(plan: Plan, out: Path) -> dict[str, Any]:
-    """Write model, logs and truth of a case; the truth."""
-    case = drawn(plan)
-    truths = []
+def sized(plan: Plan) -> tuple[Drawn, list[dict[str, Any]]]:
+    """A case with its causes as strong as planned, and what `truth.json` says of each."""
+    case, truths = drawn(plan), []
     for cause in case.causes:
         raw, left = resize(cause, case.ruler, STRENGTHS[plan.strength])
         own = {"name": cause.name, "where": cause.where, "parameters": cause.parameters(), "size": cause.size}
         truths.append(own | {"raw": raw, "left": left})
+    return case, truths
+
+
+def make(plan: Plan, out: Path) -> dict[str, Any]:
+    """Write model, logs and truth of a case; the truth."""
+    case, truths = sized(plan)
     velocity = plan.logs == "late velocities" or bool(case.rng.uniform() < 0.5 and plan.logs != "position-only")
     truth = dataclasses.asdict(plan) | {"velocity": velocity, "base": case.base, "effects": truths}
     plant = case.plant()
@@ -228,12 +267,13 @@ def again(plan: Plan, truth: dict[str, Any]) -> Drawn:
     return case
 
 
-def rivals_of(plan: Plan, truth: dict[str, Any]) -> list[dict[str, Any]]:
+def rivals_of(plan: Plan, truth: dict[str, Any] | None = None) -> list[dict[str, Any]]:
     """Of each hidden effect {"left": encoder noises that known parameters leave of it, "rivals": see `rivals`}.
 
-    As if it were there alone, by all motions, however few the case logs.
+    As if it were there alone, by all motions in MuJoCo C, however few the case logs. Without a truth that was written
+    the sizes are sought anew.
     """
-    case = again(plan, truth)
+    case = sized(plan)[0] if truth is None else again(plan, truth)
     ruler = Ruler(case.robot, case.base, FREE, seed_of(plan.kind, plan.seed))
     found = []
     for cause in case.causes:

@@ -1,4 +1,4 @@
-"""The tables of `count_intervals.py score`: rates by kind of case, by robot and by the true error of the data sheet."""
+"""The tables of `count_intervals.py score`: rates by kind of case, robot, true error of the data sheet and reality."""
 
 import json
 import math
@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from counted_cases import POOR, SEEDS, Plan, each_isolable, plans
+from counted_cases import OTHERS, POOR, SEEDS, Plan, each_isolable, plans
 from score import Outcome, label, mcnemar
 
 from bayessim_mjx.blind.outcome import LOOSE, alarm, covered, holds, labels_of, wilson
 
 ERRORS = (0.02, 0.05, 0.10, 0.20, 0.30)  # a case belongs to the nearest of these scales, by ratio
 NAMES, HOLDS = ("right", "exact", "inside", "false names"), ("strengths", "known", "known, other answers", "closed")
+REALITIES = ("mujoco", *OTHERS)
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8)  # lower ends, of stated probabilities
 SUFFIX = "_mult"  # of a known parameter in a diagnosis, a factor of the nominal value
 
@@ -54,7 +55,7 @@ def answer(plan: Plan, folder: Path) -> Answer:
     said = result.get("said")
     o = Outcome(folder, result["truth"], said, result.get("joints", {}), result.get("seconds", math.nan))
     if plan.group == "outside" and plan.kind == "unknown":
-        own = {"unexplained": [label(o) == "unexplained"]} if o.strong_enough else {}
+        own = {"unexplained": [label(o) == "unexplained"], "taken": [bool(o.named())]} if o.strong_enough else {}
         state = "no result" if said is None else "ended"
         return Answer(plan, state, own, cpu=result.get("cpu", math.nan), said=label(o))
     rates, untold = _names(o) if o.strong_enough else {}, [] if o.strong_enough else ["weaker than asked for"]
@@ -132,7 +133,9 @@ Group = tuple[str, Callable[[Answer], bool]]
 def tables(out: Path, before: Path | None = None) -> str:
     """All tables as text."""
     every = answers(out)
-    sheets, logs, outside = ([a for a in every if a.plan.group == own] for own in ("sheets", "logs", "outside"))
+    by_reality: list[Group] = [(r, lambda a, r=r: a.plan.reality == r) for r in REALITIES]
+    in_mujoco = [a for a in every if a.plan.reality == REALITIES[0]]
+    sheets, logs, outside = (_of(in_mujoco, group) for group in ("sheets", "logs", "outside"))
     by_error: list[Group] = [(f"{100 * e:g} %", lambda a, e=e: nearest(a.plan.scale) == e) for e in ERRORS]
     by_kind: list[Group] = [(k, lambda a, k=k: a.plan.kind == k) for k in ("single", "double")]
     by_system: list[Group] = [(s, lambda a, s=s: a.plan.system == s) for s in SEEDS]
@@ -145,7 +148,9 @@ def tables(out: Path, before: Path | None = None) -> str:
         f"Data sheets of any accuracy\n\n{_table(sheets, [*by_kind, *examined, *by_system])}",
         f"By the scale of the true errors\n\n{_table(sheets, by_error)}",
         f"Few and poor logs\n\n{_table(logs, [*by_logs, *examined[:2]])}",
-        f"Nothing of the library\n\n{_outside(outside)}",
+        f"Nothing of the library\n\n{_outside(outside, by_system)}",
+        f"Data sheets of any accuracy, by reality\n\n{_table(_of(every, 'sheets'), by_reality)}",
+        f"Nothing of the library, by reality\n\n{_outside(_of(every, 'outside'), by_reality)}",
         f"Stated probabilities\n\n{_stated(every)}",
         _left_out(every),
     ]
@@ -172,12 +177,16 @@ def _row(name: str, some: Sequence[Answer]) -> list[str]:
     return [name, f"{ended} of {len(some)}", *names, size, *held, seconds]
 
 
-def _outside(some: Sequence[Answer]) -> str:
-    lines = ["| | nothing hidden: alarm | cause outside the library: unexplained | CPU s |", "|---|---|---|---|"]
-    groups: list[Group] = [("all", lambda _: True)] + [(s, lambda a, s=s: a.plan.system == s) for s in SEEDS]
-    for name, own in groups:
+def _of(some: Iterable[Answer], group: str) -> list[Answer]:
+    return [a for a in some if a.plan.group == group]
+
+
+def _outside(some: Sequence[Answer], groups: Iterable[Group]) -> str:
+    header = ["", "nothing hidden: alarm", "cause outside the library: unexplained", "taken for an effect", "CPU s"]
+    lines = [f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header))]
+    for name, own in [("all", lambda _: True), *groups]:
         those = [a for a in some if own(a)]
-        cells = [_rate([x for a in those for x in a.rates.get(what, [])]) for what in ("alarm", "unexplained")]
+        cells = [_rate([x for a in those for x in a.rates.get(what, [])]) for what in ("alarm", "unexplained", "taken")]
         spent = [a.cpu for a in those if math.isfinite(a.cpu)]
         lines.append(f"| {name} | {' | '.join(cells)} | {f'{np.median(spent):.0f}' if spent else '-'} |")
     return "\n".join(lines)

@@ -30,7 +30,9 @@ def of(plans: list, logs: str, system: str) -> counted.Plan:
 
 
 def test_there_are_as_many_cases_of_each_kind_as_was_said_beforehand(plans):
-    assert len({p.name for p in plans}) == 300 and min(p.seed for p in plans) >= 9300
+    assert len({p.name for p in plans}) == 420 and min(p.seed for p in plans) >= 9300
+    plans = [p for p in plans if p.reality == "mujoco"]
+    assert len(plans) == 300
     sheets = [p for p in plans if p.group == "sheets"]
     assert Counter((p.kind, p.system) for p in plans if p.group == "outside") == {
         (kind, system): n for kind, n in (("null", 10), ("unknown", 5)) for system in counted.SEEDS
@@ -41,6 +43,37 @@ def test_there_are_as_many_cases_of_each_kind_as_was_said_beforehand(plans):
     # log-uniform from 2 to 30 %: half of the cases lie below the geometric mean, 7.7 % (75 +- 6 of 150)
     assert 57 <= sum(p.scale < 0.0775 for p in sheets) <= 93
     assert all(0.02 <= p.scale <= 0.3 for p in sheets) and {p.scale for p in plans if p.logs != "all"} == {0.05}
+
+
+def test_the_other_realities_have_sixty_cases_each_with_seeds_of_their_own(plans):
+    assert {p.reality for p in plans} == set(command.REALITIES) == {"mujoco", *counted.OTHERS}
+    for reality, first in counted.OTHERS.items():
+        own = [p for p in plans if p.reality == reality]
+        assert Counter((p.system, p.kind) for p in own) == {
+            (system, kind): n for system in counted.SEEDS for kind, n in counted.EACH.items()
+        }
+        assert {p.seed for p in own} == {first, first + 1, first + 2} and len(own) == 60
+        assert not {p.seed for p in own} & {p.seed for p in plans if p.reality != reality}
+        assert {p.logs for p in own} == {"all"} and all(0.02 <= p.scale <= 0.3 for p in own)
+    lawful = [p for p in plans if p.reality == "own laws" and p.kind in ("single", "double")]
+    assert all(p.effects[0] in counted.own_laws.LAWS and len({*p.effects}) == len(p.effects) for p in lawful)
+    assert {p.effects[0] for p in lawful} == {*counted.own_laws.LAWS}
+    assert {p.reality for p in counted.frozen()} == {"mujoco"} and len(counted.frozen()) == 60
+
+
+def test_a_case_has_the_causes_and_the_plant_of_its_reality(plans):
+    own_plant = pytest.importorskip("own_plant")
+    kinds = {}
+    for reality in command.REALITIES:
+        plan = counted.dataclasses.replace(plans[0], effects=("coulomb_friction",), reality=reality)
+        case = counted.drawn(plan)
+        case.causes[0].size = 0.1
+        kinds[reality] = type(case.causes[0]).__name__, type(case.plant())
+    assert kinds == {
+        "mujoco": ("CoulombFriction", Plant),
+        "own laws": ("OwnCoulomb", Plant),
+        "own integrator": ("CoulombFriction", own_plant.OwnPlant),
+    }
 
 
 def test_parameter_errors_have_the_scale_of_their_case(plans):
@@ -121,10 +154,24 @@ def test_tables_count_what_holds_what_misses_and_what_did_not_end(plans, tmp_pat
     assert second.rates["false names"] == [True] and second.rates["known, other answers"] == [False]
     assert second.rates["closed"] == [False]
     assert third.rates["right"] == [False] and third.rates["known, other answers"] == [True]
-    assert killed.state == "unfinished" and not killed.rates and len(found) == 300
+    assert killed.state == "unfinished" and not killed.rates and len(found) == 420
     text = tables.tables(tmp_path)
-    assert "| pendulum | 3 of 30 | 2 of 3" in text and "unfinished: 1" in text and "not begun: 296" in text
+    assert "| pendulum | 3 of 30 | 2 of 3" in text and "unfinished: 1" in text and "not begun: 416" in text
     assert "one alone: 0, 0" in tables.tables(tmp_path, tmp_path)
+
+
+def test_each_reality_has_a_row_of_its_own(plans, tmp_path):
+    one = {r: next(p for p in plans if p.reality == r and p.kind == "single") for r in command.REALITIES}
+    unknown = next(p for p in plans if p.reality == "own laws" and p.kind == "unknown")
+    result(tmp_path, one["mujoco"], [named("viscous_friction", 0.11)], 0.95)
+    result(tmp_path, one["own laws"], [named("viscous_friction", 0.2)], 0.8)
+    result(tmp_path, unknown, [named("backlash", 0.1)], None)
+    text = tables.tables(tmp_path)
+    by_logs, rows = text.split("Data sheets of any accuracy, by reality")
+    assert "| all | 1 of 150 | 1 of 1" in by_logs and "| all | 2 of 222 | 2 of 2" in rows
+    assert "| mujoco | 1 of 150 | 1 of 1" in rows and "| own laws | 1 of 36 | 1 of 1" in rows
+    assert "| own integrator | 0 of 36 | - |" in rows
+    assert "| own laws | - | 0 of 1, 0 % (0 to 79) | 1 of 1, 100 % (21 to 100) | 50 |" in rows
 
 
 def test_tables_of_alarms_unknown_causes_and_stated_probabilities(plans, tmp_path):
@@ -145,10 +192,10 @@ def test_tables_of_alarms_unknown_causes_and_stated_probabilities(plans, tmp_pat
         path.write_text(json.dumps(told))
     found = {a.plan.name: a for a in tables.answers(tmp_path)}
     assert found[null.name].rates["alarm"] == [True] and found[null.name].stated == (0.7, False)
-    assert found[other.name].rates == {"unexplained": [False]} and found[other.name].stated is None
+    assert found[other.name].rates == {"unexplained": [False], "taken": [False]} and found[other.name].stated is None
     assert found[single.name].stated == (0.9, True)
     text = tables.tables(tmp_path)
-    assert "| pendulum | 1 of 1, 100 % (21 to 100) | 0 of 1, 0 % (0 to 79) | 50 |" in text
+    assert "| pendulum | 1 of 1, 100 % (21 to 100) | 0 of 1, 0 % (0 to 79) | 0 of 1, 0 % (0 to 79) | 50 |" in text
     assert "Brier score 0.250 of 2 answers" in text  # (.7^2 + .1^2) / 2
 
 
@@ -165,9 +212,8 @@ def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_pat
         return begun[-1]
 
     monkeypatch.setattr(command, "_begin", sleep)
-    args = argparse.Namespace(
-        out=tmp_path, jobs=1, minutes=0.01, only="sheets", systems="leg", shard="1/10", more="--accuracy 5%", does="run"
-    )
+    given = {"jobs": 1, "minutes": 0.01, "only": "sheets", "systems": "leg", "shard": "1/10", "reality": "mujoco"}
+    args = argparse.Namespace(out=tmp_path, more="--accuracy 5%", does="run", case="", **given)
     for _ in range(2):
         command.run(args)
     assert [p.wait(5) for p in begun] == [-9, -9]
@@ -176,6 +222,35 @@ def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_pat
     (first / "result.json").write_text("{}")
     command.run(args)
     assert "1 cases" in capsys.readouterr().out and os.path.exists(first / "plan.json")
+
+
+def test_one_case_is_examined_by_its_name_without_a_result_and_only_once(plans, tmp_path, monkeypatch, capsys):
+    begun: list = []
+
+    def write(folder: Path, core: int | None, args: argparse.Namespace) -> subprocess.Popen:
+        begun.append((folder.name, core))
+        (folder / "isolable.json").write_text("[]")
+        return subprocess.Popen(["true"], start_new_session=True)
+
+    monkeypatch.setattr(command, "_begin", write)
+    name = next(p.name for p in plans if p.reality == "own integrator")
+    for _ in range(2):
+        monkeypatch.setattr(sys, "argv", ["count_intervals.py", "isolable", str(tmp_path), "--case", name])
+        command.main()
+    assert begun == [(name, None)] and "0 cases" in capsys.readouterr().out
+
+
+def test_sizes_are_those_of_the_written_case_where_there_is_one(plans, tmp_path, monkeypatch):
+    given: list = []
+    monkeypatch.setattr(counted, "rivals_of", lambda plan, truth: given.append((plan.name, truth)) or [])
+    folder = tmp_path / plans[0].name
+    folder.mkdir()
+    (folder / "plan.json").write_text(json.dumps(counted.dataclasses.asdict(plans[0])))
+    command.rivals(folder)
+    (folder / "result.json").write_text(json.dumps({"truth": {"effects": [1]}}))
+    command.rivals(folder)
+    assert given == [(plans[0].name, None), (plans[0].name, {"effects": [1]})]
+    assert (folder / "isolable.json").read_text() == "[]"
 
 
 def test_a_case_is_isolable_if_neither_known_parameters_nor_another_cause_do_the_work():

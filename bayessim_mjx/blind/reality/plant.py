@@ -169,7 +169,7 @@ class Plant:
         count = self.steps if steps is None else steps
         if not self.stepped:
             self.data.ctrl[:] = command
-            mujoco.mj_step(self.model, self.data, count)
+            self.move(count)
             return
         for _ in range(count):
             u = command.copy()
@@ -179,10 +179,14 @@ class Plant:
                 cause.command(self, u)
                 cause.force(self)
             self.data.ctrl[:] = u
-            mujoco.mj_step(self.model, self.data)
+            self.move(1)
             seen = self.link()
             for cause in self.stepped:
                 cause.watch(self, *seen)
+
+    def move(self, count: int) -> None:
+        """So many steps under the commands and forces that are in `data`."""
+        mujoco.mj_step(self.model, self.data, count)
 
     def measure(self) -> tuple[np.ndarray, np.ndarray]:
         """What encoders without noise show."""
