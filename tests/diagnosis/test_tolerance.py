@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import tolerance
+from bayessim_mjx.diagnosis.evidence.force_left import ForceLeft
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
@@ -102,15 +103,17 @@ def gap(left, limit=0.02):
 
 
 def findings(rms, noise=50.0, windows=8, beyond=()):
-    """A selection that names friction and leaves `rms` noises of a gap of 1000; beyond: of whole logs."""
+    """A selection that names friction and leaves a force of `rms` noises of a gap of 1000; beyond: of whole logs."""
 
     def prediction(level):
         return Prediction(np.full((windows, 5, 2), float(level)), np.zeros((windows, 4)))
 
     fit = SimpleNamespace(coordinates=(), values=())
     winner = SimpleNamespace(effects=(SimpleNamespace(coordinates=()),), total=windows * noise * rms**2, fit=fit)
+    square, one = rms**2 - 1.0, np.ones(2)
     selection = SimpleNamespace(
         ambiguous=False,
+        force=ForceLeft(one, one, one, 1e3, square, 1e-3 * square, one, 1.0),
         rivals={},
         state=SimpleNamespace(
             noise=noise,

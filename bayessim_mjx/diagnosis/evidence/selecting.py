@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import phrases
-from bayessim_mjx.diagnosis.evidence import masked_effects
+from bayessim_mjx.diagnosis.evidence import force_left, masked_effects
+from bayessim_mjx.diagnosis.evidence.force_left import ForceLeft
 from bayessim_mjx.diagnosis.evidence.laws import compatible, special_cases
 from bayessim_mjx.diagnosis.evidence.search import Search
 from bayessim_mjx.diagnosis.evidence.sets import Weighed
@@ -69,6 +70,7 @@ class Selection:
         hidden: labels of effects that would not show beside those of the answer (`masked_effects.by_effects`).
         stand_ins: {known parameter: labels of effects that it may stand for} (`masked_effects.by_parameters`).
         weighed: probabilities of the sets that were fitted; estimated: posterior of the answer's numbers.
+        force: what the answer leaves as force.
     """
 
     state: SearchState
@@ -82,6 +84,7 @@ class Selection:
     stand_ins: Mapping[str, tuple[str, ...]]
     weighed: Weighed
     estimated: Estimated
+    force: ForceLeft
 
     @property
     def ambiguous(self) -> bool:
@@ -123,6 +126,7 @@ def select(
         stand_ins=masked_effects.by_parameters(state, answer),
         weighed=found,
         estimated=estimated(search.weighing, found),
+        force=force_left.of_set(search.weighing, found.answer),
     )
 
 

@@ -21,10 +21,11 @@ from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.residual import motion_inputs
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
+from bayessim_mjx.diagnosis.residual.regression import SIZES as CLIPPED
 from bayessim_mjx.diagnosis.residual.regression import OnFeatures, Regression, Sums
 
 Array = NDArray[np.float64]
-FOLDS = 4  # of conditions, at most: each is one more training of the network
+FOLDS = 4  # of conditions, at most: each is one more training of the network; a rule of thumb
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +70,18 @@ def race(fitter: Fitter, base: Fit, named: Fit | None, missing: Disturbance, noi
 
 @dataclass(frozen=True)
 class Sizes:
-    """Of the network and its training; not tuned."""
+    """Of the network and its training. Rules of thumb, neither tuned nor counted: no verdict rests on them.
 
-    hidden: int = 6  # neurons for each joint
-    seeds: int = 2  # networks whose forces are averaged, so that no single draw of first weights counts
+    Attributes:
+        hidden: neurons for each joint; iterations: of the training, at most.
+        seeds: networks whose forces are averaged, so that no single draw of first weights counts.
+        spread: prior standard deviations of weights into and out of the hidden layer.
+    """
+
+    hidden: int = 6
+    seeds: int = 2
     iterations: int = 40
-    spread: tuple[float, float] = (1.5, 0.3)  # prior standard deviations of weights into and out of the hidden layer
-    limit: float = 4.0  # standard deviations at which inputs are clipped: no extrapolation
+    spread: tuple[float, float] = (1.5, 0.3)
 
 
 SIZES = Sizes()
@@ -103,7 +109,7 @@ def _inputs(inputs: Inputs) -> Array:
     others = [np.stack([np.delete(x, v, 2) for v in range(nv)], 2) for x in (inputs.position, inputs.speed)]
     z = np.concatenate([np.stack(own, 3), *others], 3)
     mean, sd = z.mean((0, 1)), z.std((0, 1))
-    z = np.clip((z - mean) / np.where(sd > 1e-12, sd, np.inf), -SIZES.limit, SIZES.limit)
+    z = np.clip((z - mean) / np.where(sd > 1e-12, sd, np.inf), -CLIPPED.limit, CLIPPED.limit)
     z = np.concatenate([z, np.ones((*z.shape[:3], 1))], 3)
     return np.ascontiguousarray(np.moveaxis(z, 2, 0))
 
@@ -171,13 +177,20 @@ class Rules:
     """How large a formula may be.
 
     A term stays if it explains more than chance does: log(candidates) + log(numbers) / 2 nats (the extended
-    Bayesian criterion of Chen and Chen, 2008), in misfits as large as those that are left.
+    Bayesian criterion of Chen and Chen, 2008), in misfits as large as those that are left. The numbers below are rules
+    of thumb, not counted.
+
+    Attributes:
+        most: terms for each joint on average: what a person reads.
+        tried: terms that are fitted in each turn, the most promising ones by linear algebra.
+        ridge: of the curvature, against terms that are alike.
+        slow: share of the largest speed within which a sign changes gradually.
     """
 
-    most: int = 3  # terms for each joint on average
-    tried: int = 5  # terms that are fitted in each turn, the most promising ones by linear algebra
+    most: int = 3
+    tried: int = 5
     ridge: float = 1e-6
-    slow: float = 0.02  # of the largest speed, where a sign changes gradually
+    slow: float = 0.02
 
 
 RULES = Rules()

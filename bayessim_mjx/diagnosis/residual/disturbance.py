@@ -21,10 +21,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sizes:
-    """Pulses that represent the missing force."""
+    """Pulses that represent the missing force. Rules of thumb, not counted.
 
-    pulse: float = 0.03  # of the robot's force scale: finite differences
-    # about so many forces per window unless told otherwise; each costs one simulation of all windows
+    Attributes:
+        pulse: of a finite difference, as a share of the robot's force scale. Less is lost in single precision.
+        columns: forces in a window, about so many. Each costs one simulation of all windows.
+    """
+
+    pulse: float = 0.03
     columns: int = 72
 
 
@@ -105,11 +109,17 @@ def linearise(fitter: Fitter, fit: Fit, knots: int | None = None, D: Array | Non
 
 @dataclass(frozen=True)
 class Priors:
-    """Sizes and memories of the missing force that are tried, and ends of the noise."""
+    """First guesses of the missing force, from which its likelihood is maximised. Rules of thumb, not counted.
 
-    amplitudes: tuple[float, ...] = (0.0001, 0.001, 0.01, 0.1)  # of the force scale, first guesses
-    memories: tuple[float, ...] = (1.0, 4.0, 16.0)  # node spacings over which the force stays alike
-    noise: tuple[float, float] = (0.3, 1000000.0)  # limits of the factor on the noise's variance
+    Attributes:
+        amplitudes: of the force scale, a decade apart: from an integrator's error to a tenth of the drives' forces.
+        memories: node spacings over which the force stays alike: from white to the length of a window.
+        noise: lower end of the factor on the noise's variance, so that no force takes over all of the noise.
+    """
+
+    amplitudes: tuple[float, ...] = (0.0001, 0.001, 0.01, 0.1)
+    memories: tuple[float, ...] = (1.0, 4.0, 16.0)
+    noise: float = 0.3
 
 
 PRIORS = Priors()
@@ -122,10 +132,9 @@ class Disturbance:
     Attributes:
         force, sd: `[W, m, nv]`, posterior mean and standard deviation, N m or N.
         gain: `[W, nv, m, m]`, expected mean = gain times a true force on this dof (the prior pulls to zero).
-        amplitude: `[nv]`, prior standard deviation; memory: s, its correlation time.
+        amplitude: `[nv]`, prior standard deviation.
         noise: factor on the standard deviation of the measurement noise.
         values: `[k]`, the fit's parameters, estimated together with the force.
-        evidence: log marginal likelihood; without: the same for no force at all.
         time: `[m]` s after the windows' starts.
         linear: what it was computed from.
     """
@@ -134,11 +143,8 @@ class Disturbance:
     sd: Array
     gain: Array
     amplitude: Array
-    memory: float
     noise: float
     values: Array
-    evidence: float
-    without: float
     time: Array
     linear: Linear
 
@@ -233,7 +239,7 @@ class _Posterior:
         amplitude = np.sqrt(weight @ second / (weight.sum() * self.linear.nodes))
         full = np.concatenate([np.repeat(self.p[None], len(self.d), 0), self.d], 1)
         left = q.at(full) + np.einsum("wij,wji->w", q.S[:, k:, k:], self.cov)
-        noise = float(np.clip(weight @ left / (weight.sum() * self.linear.r.shape[1]), *PRIORS.noise))
+        noise = max(float(weight @ left) / (weight.sum() * self.linear.r.shape[1]), PRIORS.noise)
         return replace(self, amplitude=np.maximum(amplitude, 1e-7 * self.linear.scale), noise=noise).solved()
 
 
@@ -283,18 +289,14 @@ def _finish(fitter: Fitter, fit: Fit, found: _Posterior) -> Disturbance:
     k = fit.A.shape[2]
     whole = found.cov @ linear.quadratic.S[:, k:, k:] / found.noise
     gain = np.einsum("wvivj->wvij", whole.reshape(*shape, *shape[1:]))
-    nothing = replace(found, amplitude=1e-7 * linear.scale)
     spacing = windows.steps * windows.dt / linear.nodes
     return Disturbance(
         force=np.swapaxes(found.d.reshape(shape), 1, 2),
         sd=sd,
         gain=gain,
         amplitude=found.amplitude,
-        memory=found.memory * spacing,
         noise=float(np.sqrt(found.noise)),
         values=fit.values + found.p,
-        evidence=found.evidence,
-        without=_refined_noise(nothing).evidence,
         time=np.asarray((np.arange(linear.nodes) + 0.5) * spacing, np.float64),
         linear=linear,
     )
@@ -309,13 +311,6 @@ def _from_parameters(fit: Fit, found: _Posterior) -> Array:
     gain = found.cov @ S[:, k:, :k]
     Spp = np.einsum("w,wij->ij", fit.weight, S[:, :k, :k] - np.einsum("wdi,wdj->wij", S[:, k:, :k], gain))
     return np.einsum("wdi,ij,wdj->wd", gain, np.linalg.inv(Spp + np.diag(fit.prior()[0])), gain)
-
-
-def _refined_noise(found: _Posterior) -> _Posterior:
-    """Only the noise learnt, the force staying nothing."""
-    for _ in range(4):
-        found = replace(found.solved().learnt(), amplitude=found.amplitude)
-    return found.solved()
 
 
 def pooled(values: Array, reliability: Array, axis: int | Sequence[int] | None = None) -> Array:

@@ -25,12 +25,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How a flexible force is fitted and when it counts."""
+    """How a flexible force is fitted. Rules of thumb, not counted: they decide what a report shows, and no verdict.
 
-    ridges: tuple[float, ...] = (0.0001, 0.001, 0.01, 0.1, 1.0)  # of the mean curvature of each joint's features
-    block: float = 1.0  # s, held-out blocks within conditions
+    Attributes:
+        ridges: of the mean curvature of each joint's features, a decade apart; the best one is chosen on held-out data.
+        block: s, of held-out blocks within conditions; folds: into which these go in turn.
+        slack: share of the best ridge's gain that may be lost for a plainer model.
+    """
+
+    ridges: tuple[float, ...] = (0.0001, 0.001, 0.01, 0.1, 1.0)
+    block: float = 1.0
     folds: int = 4
-    slack: float = 0.02  # of the best ridge's gain, for a plainer model
+    slack: float = 0.02
 
 
 RULES = Rules()

@@ -24,18 +24,26 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How spectra are estimated and when something stands out of them."""
+    """How spectra are estimated, and what of them is mentioned. Rules of thumb, not counted.
 
-    segment: float = 4.0  # s
-    # of the multitaper estimate (Thomson, 1982)
+    Attributes:
+        segment: s, of a spectrum; least: values in a row that one is made of.
+        tapers, bandwidth: of the multitaper estimate (Thomson, 1982).
+        coherent: coherence from which on a frequency counts for the phase.
+        line: times that a line is above its surroundings; stands: times that an order is above the others.
+        small: share of the force's rms, below which an order is not mentioned.
+        turns: periods of an order within the range of motion.
+    """
+
+    segment: float = 4.0
     tapers: int = 4
     bandwidth: float = 2.5
-    coherent: float = 0.5  # below this a frequency says nothing about phase
-    line: float = 6.0  # a line stands so many times above its surroundings
-    small: float = 0.1  # of the force's rms: smaller orders are not mentioned
-    stands: float = 4.0  # an order stands so many times above the others
-    least: int = 16  # values in a row that a spectrum is made of
-    turns: float = 2.0  # periods that an order must have within the range of motion
+    coherent: float = 0.5
+    line: float = 6.0
+    small: float = 0.1
+    stands: float = 4.0
+    least: int = 16
+    turns: float = 2.0
 
 
 RULES = Rules()

@@ -19,11 +19,16 @@ _AXIAL = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 
 @dataclass(frozen=True)
 class Sizes:
-    """What counts as moving, and how far back inputs reach."""
+    """What counts as moving, and how far back inputs reach. Rules of thumb, not counted.
 
-    # of the speed scale: limits of the speed below which a joint has no direction of its own
+    Attributes:
+        moving: of the speed scale, ends of the speed below which a joint has no direction of its own; in between three
+            standard deviations of the noise.
+        lags: control steps of past effort.
+    """
+
     moving: tuple[float, float] = (0.003, 0.03)
-    lags: tuple[int, int] = (1, 3)  # control steps of past effort
+    lags: tuple[int, int] = (1, 3)
 
 
 SIZES = Sizes()

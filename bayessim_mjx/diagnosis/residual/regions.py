@@ -17,15 +17,23 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How states are split into regions, and when a region is told."""
+    """How states are split into regions, and which regions are mentioned. Rules of thumb, not counted, but for `rate`.
+
+    Attributes:
+        bins: of a map; shuffles: of windows, behind its p-values.
+        least: share of the best reliability, below which a node's force is not used.
+        rate: of false discoveries among the significant bins (Benjamini and Hochberg, 1995).
+        depth: of a tree, at most; filled: share of all nodes that every leaf holds at least.
+        worth: share of the held-out power that a deeper tree has to gain.
+    """
 
     bins: int = 8
-    least: float = 0.3  # of the best reliability: nodes below tell nothing
-    rate: float = 0.05  # false discoveries among the significant bins
+    least: float = 0.3
+    rate: float = 0.05
     shuffles: int = 300
     depth: int = 3
-    filled: float = 0.05  # of all nodes, at least, in every leaf
-    worth: float = 0.05  # of held-out power that a deeper tree must gain
+    filled: float = 0.05
+    worth: float = 0.05
 
 
 RULES = Rules()

@@ -23,11 +23,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sizes:
-    """How many features are drawn and kept, and how far they may extrapolate."""
+    """Random features, and how far all features may extrapolate. Rules of thumb, not counted.
 
-    random: int = 24  # random features per joint and seed
-    picked: int = 5  # inputs of each
-    limit: float = 4.0  # standard deviations at which features are clipped: no extrapolation
+    Attributes:
+        random: features for each joint and seed; picked: inputs of each.
+        limit: standard deviations at which features and inputs are clipped: a normal one is beyond in 1 of 16 000.
+    """
+
+    random: int = 24
+    picked: int = 5
+    limit: float = 4.0
 
 
 SIZES = Sizes()

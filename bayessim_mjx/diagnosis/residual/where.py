@@ -26,10 +26,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """When a place is worth telling."""
+    """When a place is mentioned. Rules of thumb, not counted.
 
-    worth: float = 0.1  # share of the gap that makes a joint worth a sentence
-    least_share: float = 0.15  # share of a joint's missing power that a region must explain to be told
+    Attributes:
+        worth: share of the gap from which on a joint has a sentence.
+        least_share: share of a joint's missing power that a region has to explain.
+    """
+
+    worth: float = 0.1
+    least_share: float = 0.15
 
 
 RULES = Rules()
@@ -129,10 +134,15 @@ def _told(found: Tree) -> tuple[Leaf, ...]:
 
 @dataclass(frozen=True)
 class Limits:
-    """What counts as just now, and as small."""
+    """Which parts of a signature are mentioned. Rules of thumb, not counted.
 
-    recent: float = 0.1  # s after a reversal
-    small: float = 0.2  # of the force's rms: contributions below are not mentioned
+    Attributes:
+        recent: s after a reversal, in which a force counts as recent.
+        small: share of the force's rms, below which a part is not mentioned.
+    """
+
+    recent: float = 0.1
+    small: float = 0.2
 
 
 LIMITS = Limits()

@@ -29,7 +29,7 @@ from bayessim_mjx.diagnosis.summary.left_in_words import (
     spectra_in_words,
 )
 from bayessim_mjx.diagnosis.summary.sentences import horizon_warning, sentences
-from bayessim_mjx.diagnosis.summary.verdict import verdict_of
+from bayessim_mjx.diagnosis.summary.verdict import force_in_numbers, verdict_of
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
@@ -65,7 +65,8 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     texts = sentences(verdict, effects, parameters, found, far)
     texts += [not_on_offer(e.name for e in setup.physics.effects)] if verdict.name == "unexplained" else []
     notes = [*setup.warnings, *steps, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
-    more = {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
+    more: dict[str, Any] = {"force_left": force_in_numbers(found, far)}
+    more |= {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
     lies = [*located_in_words(where.found), *spectra_in_words(where.spectra)] if where else []
     rivals = black_boxes_in_words(found.part(BlackBoxes), setup.fitter.simulator.windows.blocks)
     return Diagnosis(

@@ -48,8 +48,7 @@ IMPERFECT = (
     "No candidate closes what remains, {remains_of} of the squared gap: the law is not quite that of the real system."
 )
 NEAREST = "Of the library, {named} {come} nearest"
-BEATEN = "; a flexible force alone predicts held-out {held} far better"
-ON_TOP = "; a flexible force on top of {them} still closes {remains} of the gap"
+ON_TOP = "; a force that {they_lack} makes {remains} of the gap"
 FALLS = (
     "With {them} the recalibrated simulator's gap falls from {calibrated} to {with_effects} on held-out {held}. "
     "Before {they} fitted, {predicted} of the squared gap above the noise was predicted to close; {realised} did."
@@ -123,7 +122,7 @@ def sentences(
 ) -> list[str]:
     """The verdict, most important first."""
     name, cut = verdict.name, found.selection.state.fitter.simulator.windows
-    texts = verdict_in_words(name, effects, far, verdict.remains, verdict.beaten)
+    texts = verdict_in_words(name, effects, far, verdict.remains)
     far_off, known = verdict.bent
     texts += [BENT.format(far=far_off, known=known)] if known else []
     if verdict.builds_up:
@@ -134,7 +133,7 @@ def sentences(
     texts += [_hidden(found.selection.hidden, len(effects))]
     if verdict.noise is not None and (name == "noise" or far.beyond):
         texts.append(_of_sensors(verdict.noise.memory * cut.steps * cut.dt))
-    elif not effects and verdict.remains == 0.0 and found.selection.state.above_noise(found.selection.state.base):
+    elif not effects and found.flexible_winner is not None and not found.flexible_winner.condition.significant:
         texts.append(CHANCE.format(calibrated=stage_in_words(far, "calibrated"), held=_held(far)))
     if name == "unexplained" and found.flexible_winner is not None:
         texts += [f"{text[:1].upper()}{text[1:]}." for text in flexible_in_words(found.flexible_winner, cut.blocks)]
@@ -200,14 +199,11 @@ def _of_sensors(memory: float) -> str:
     return OF_SENSORS.format(colour=f"correlated over about {1e3 * memory:.2g} ms" if memory else "white")
 
 
-def verdict_in_words(
-    name: str, effects: list[FoundEffect], far: Gap, remains: float = 0.0, beaten: bool = False
-) -> list[str]:
+def verdict_in_words(name: str, effects: list[FoundEffect], far: Gap, remains: float = 0.0) -> list[str]:
     """Verdict, how far, and what remains against the tolerance.
 
     Args:
-        remains: share of the gap that a flexible force closes on top of the effects; beaten: whether a flexible force
-            alone does better than they do.
+        remains: share of the gap that a force makes which the effects leave.
     """
     promised, went = (far.closed.get(k, math.nan) for k in ("predicted", "realised"))
     one = len(effects) == 1
@@ -215,6 +211,7 @@ def verdict_in_words(
         "named": listed(phrases.by_law([(e.name, e.where) for e in effects])),
         "them": "it" if one else "them",
         "they": "it was" if one else "they were",
+        "they_lack": "it lacks" if one else "they lack",
         "come": "comes" if one else "come",
         "close": "closes" if one else "close",
         "remains": percent(remains),
@@ -232,7 +229,7 @@ def verdict_in_words(
     heads = HEADS if of_one(quoted**2).at_noise else ABOVE
     out = [PARTLY if partly else REST[name] if both else heads[name]]
     if effects:
-        more = ON_TOP if remains > 0.05 else BEATEN if beaten else ""
+        more = ON_TOP if remains > 0.0 else ""
         out += [f"{NEAREST}{more}."] if name == "unexplained" and (more or not partly) else []
         out.append(FALLS)
         out += [IMPERFECT] if both and went < 1.0 else []

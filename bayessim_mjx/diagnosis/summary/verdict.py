@@ -2,40 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
 from bayessim_mjx.diagnosis import data_sheet
+from bayessim_mjx.diagnosis.evidence.sets import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
-from bayessim_mjx.diagnosis.gap import of_one, of_rms
+from bayessim_mjx.diagnosis.gap import of_one
 from bayessim_mjx.diagnosis.residual.origin import Origin, origin
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.search_state import FLOOR
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
+from bayessim_mjx.logs.log import Channels
 
 
 @dataclass(frozen=True)
 class Limits:
-    """When a verdict says that something remains unexplained.
+    """When a verdict says that something remains unexplained (docs/decisions/force_left.md has the counts).
 
-    Rules of thumb, chosen on 22 recorded cases in which something was named: what is rightly named left 3 % of the gap
-    at most, causes that the library lacks 8 to 60 %. Rates on later cases: benchmarks/records/diagnosis_fresh.json.
+    Attributes:
+        share: of the squared gap above the noise. Effects that leave a missing force which makes more of it are not the
+            explanation. Those that leave less are, though their law may be imperfect.
     """
 
-    # noise standard deviations that remain: of a simulator without effects, and beside effects that leave a large
-    # share (docs/decisions/at_noise.md)
-    matters: float = 1.5
-    shows: float = 1.2
-    # share of the calibrated gap: named effects that leave more, or on top of which a flexible force closes more, are
-    # not the explanation; what leaves less is, though its law may be imperfect
     share: float = 0.15
-    # shares of the named effects' cost, and of the gap, by which a flexible force alone does better
-    beaten: float = 0.4
-    relevant: float = 0.05
     # chance that known parameters of a robot lie together as far from their data sheet as the named effects leave them,
     # were it so many times as inaccurate as stated (or as the least accurate ones, `data_sheet.WORST`, where nobody
     # stated it): below that the effects explain the motion of another robot. In 63 simulated
@@ -57,9 +53,9 @@ class Verdict:
     """Its name, and what it rests on.
 
     Attributes:
-        remains: share of the calibrated gap that a flexible force still closes on top of the effects; 0 where not
-            significant. beaten: whether a flexible force alone does much better than they do.
-        noise: where what remains comes from, if nothing predicts it and no force does; else None.
+        remains: share of the gap that the missing force makes which the answer leaves, posterior mean; 0 where it is
+            probably not relevant. chance: probability that it is.
+        noise: where what remains comes from, if it is noise of the sensors larger than estimated; else None.
         bent: (known parameters far from the data sheet, of so many), where that is no chance; else (0, 0).
         builds_up: times what is likely, rms, that the error grows to over whole logs, where windows hardly show it;
             else 0. It is told, and has no part in the name.
@@ -67,7 +63,7 @@ class Verdict:
 
     name: str
     remains: float
-    beaten: bool
+    chance: float
     noise: Origin | None
     bent: tuple[int, int] = (0, 0)
     builds_up: float = 0.0
@@ -75,10 +71,46 @@ class Verdict:
 
 def verdict_of(found: Findings, far: Gap) -> Verdict:
     """The verdict on what was found; `far`: what remains of the gap."""
-    left, alone, noise = remains(found), beaten(found), sensors_noise(found)
+    force, gap = found.selection.force, gap_of(found, far)
+    chance = force.chance(relevant(found, far))
+    probable = chance > ODDS.strong / (1.0 + ODDS.strong)
+    noise = sensors_noise(found) if probable else None
+    missing = probable and noise is None
     off = bent(found.model) if found.model.effects else (0, 0)
-    name = _name(found, far, left, alone, noise)
-    return Verdict("unexplained" if any(off) else name, left, alone, noise, off, builds_up(found, far))
+    name = "unexplained" if missing or any(off) else _explained(found, noise)
+    return Verdict(name, force.motion / gap if missing else 0.0, chance, noise, off, builds_up(found, far))
+
+
+def gap_of(found: Findings, far: Gap) -> float:
+    """The squared gap that the answer had to close, above the noise, in noise variances; at least a relevant one.
+
+    It is that of joints which keep their speed where these do better than the recalibrated simulator. Beside forces
+    that are far off, effects that only keep it from moving close almost all of its gap.
+    """
+    before = min(far.calibrated, math.inf if far.coasting is None else far.coasting)
+    return max(before**2 - found.selection.force.noise, RELEVANCE.noise)
+
+
+def relevant(found: Findings, far: Gap) -> float:
+    """The square that a missing force has to move to be relevant, in noise variances of each residual."""
+    if not found.model.effects:
+        return FLOOR**2 - 1.0  # of the recalibrated simulator alone less needs no explanation
+    return max(RELEVANCE.noise, LIMITS.share * gap_of(found, far))
+
+
+def force_in_numbers(found: Findings, far: Gap) -> dict[str, Any]:
+    """The missing force for JSON: by joint its rms in N m or N, its evidence, its share of the gap, its relevance."""
+    force, gap = found.selection.force, gap_of(found, far)
+    names = Channels.of(found.setup.physics.mj_model).qvel
+    rows = zip(names, force.amplitude, force.low, force.high, force.by_joint, strict=True)
+    return {
+        "joints": [{"joint": n, "rms": a, "low": low, "high": high, "share": s / gap} for n, a, low, high, s in rows],
+        "nats": force.nats,
+        "share": force.motion / gap,
+        "share_ci": [end / gap for end in force.interval()],
+        "relevant_share": relevant(found, far) / gap,
+        "chance": force.chance(relevant(found, far)),
+    }
 
 
 def bent(model: Model) -> tuple[int, int]:
@@ -98,82 +130,34 @@ def _precise(c: Coordinate) -> float:
 def builds_up(found: Findings, far: Gap) -> float:
     """How many times larger (rms) the error over whole logs is than noise, start and parameters make likely; else 0.
 
-    Only where windows are within a few noises, which begin anew at the measured state: where they show more, that is
-    what is told. A law that is not quite right may pass in them, but so may a right one with an integrator's error.
+    Only where windows are at the noise, which begin anew at the measured state: where they show more, that is what is
+    told. A law that is not quite right may pass in them, but so may a right one with an integrator's error.
     """
     over = found.part(Whole)
     if over is None or not len(over.beyond) or not found.model.effects:
         return 0.0
-    times = over.over_likely
-    return times if times > LIMITS.builds_up and far.with_effects <= LIMITS.matters else 0.0
+    return over.over_likely if over.over_likely > LIMITS.builds_up and far.with_effects <= FLOOR else 0.0
 
 
-def _name(found: Findings, far: Gap, remaining: float, alone: bool, noise: Origin | None) -> str:
+def _explained(found: Findings, noise: Origin | None) -> str:
+    """The verdict where no relevant force is missing."""
     state, model = found.selection.state, found.model
     if model.effects:
-        matters = far.with_effects > LIMITS.shows or bool(far.beyond)
-        little = of_rms(far.calibrated, far.with_effects).left <= LIMITS.share or noise is not None
-        little = little and not standstill(far)
-        structured = state.above_noise(model) and not remaining <= LIMITS.share  # NaN: all is on top
-        if (matters and not little) or structured or (found.flexible_winner is not None and alone):
-            return "unexplained"
         return "ambiguous" if found.selection.ambiguous else "effects"
+    if noise is not None or found.selection.force.noise > FLOOR**2:
+        return "noise"
     calibrated = state.gap(state.base)
-    if calibrated.rms > LIMITS.matters:
-        return "unexplained" if noise is None or remaining > LIMITS.share else "noise"
-    if state.above_noise(state.base) and remaining > LIMITS.share:
-        return "unexplained"
     q, _ = state.nominal.quadratic(state.fitter.spread)
     nominal = of_one(float(q.c.sum()), calibrated.noise)
     return "parameters" if nominal.rms > FLOOR and nominal.after > 1.1 * calibrated.after else "no_gap"
 
 
-def standstill(far: Gap) -> bool:
-    """Whether effects hardly do better than joints that keep their speed, in the place of a simulator that does worse.
-
-    Beside forces that are far off, whatever hardly accelerates closes almost all of the gap. Noise of the sensors
-    excuses nothing here: it is in both.
-    """
-    if far.coasting is None or far.coasting >= far.calibrated:
-        return False
-    return not of_rms(far.coasting, far.with_effects).left <= LIMITS.share  # also where they coast within the noise
-
-
-def remains(found: Findings) -> float:
-    """Share of the calibrated gap that a flexible force still closes on top of the winner; 0 where not significant."""
-    flex, base, model = found.flexible_winner, found.selection.state.base, found.model
-    if flex is None or not flex.condition.significant:
-        return 0.0
-    cost = float(model.plain.sum())  # as the force's is: of predictions, with nothing open
-    top = cost - min(float(flex.condition.cost.sum()), cost)
-    return of_one(float(base.plain.sum()), found.selection.state.noise * len(base.cost)).share(top)
-
-
-def beaten(found: Findings) -> bool:
-    """Whether a flexible force alone predicts held-out conditions much better than the named effects do.
-
-    By a relevant share of the gap too: of effects that close 99.9 % something is left that a force can learn.
-    """
-    state, base, model = found.selection.state, found.flexible_base, found.model
-    if base is None or not base.condition.significant:
-        return False
-    cost = float(model.plain.sum())
-    better = cost - float(base.condition.cost.sum())
-    share = of_one(float(state.base.plain.sum()), state.noise * len(state.base.cost)).share(better)
-    return better > LIMITS.beaten * cost and share > LIMITS.relevant
-
-
 def sensors_noise(found: Findings) -> Origin | None:
-    """Where what remains comes from, if that is noise of the sensors, larger than estimated; None if not.
-
-    A flexible force predicts nothing of it, neither in other conditions nor in between, and its covariance is not that
-    of the trace of forces.
-    """
-    flex, missing = found.flexible_winner, found.disturbance
-    if flex is None or missing is None or flex.condition.significant or flex.interpolation.significant:
+    """Where what remains comes from, if its covariance is that of noise of the sensors, and not that of forces."""
+    missing, fit = found.disturbance, found.model.fit
+    if missing is None:
         return None
-    fit = found.model.fit
     fitter = found.selection.state.fitter
     channels = int(fitter.used.sum())
-    where = origin(fit.r, fit.B, missing.linear.D, missing.amplitude, channels, fit.weight, fitter.rate())
+    where = origin(fit.r, fit.B, missing.linear.D, found.selection.force.amplitude, channels, fit.weight, fitter.rate())
     return where if where.of_sensors else None

@@ -92,7 +92,7 @@ def concluded(pool, answer):
     even = dict.fromkeys(pool.models, 1 / len(pool.models))
     weighed = Weighed(even, dict.fromkeys(pool.models, 0.0), {}, even)
     shares = {"subsets": {}, "promised": (0.0, {}), "chosen": {}, "elsewhere": float("nan")}
-    nothing = {"hidden": (), "stand_ins": {}, "rivals": {}, "estimated": None}
+    nothing = {"hidden": (), "stand_ins": {}, "rivals": {}, "estimated": None, "force": None}
     return Selection(pool, answer, weighed=weighed, **shares, **nothing)
 
 
