@@ -23,13 +23,12 @@ from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
 from bayessim_mjx.diagnosis.selection.fits import begin, cut_back
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model
+from bayessim_mjx.diagnosis.selection.screen import room
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings
 from bayessim_mjx.diagnosis.selection.successive_halving import Entries, fit_entries
 from bayessim_mjx.diagnosis.statistics import shapley
 
 Array = NDArray[np.float64]
-MANY = 4  # effects; of an answer with more not every subset is fitted
-FURTHEST = 2.0  # times the screened start; a secant is not trusted further
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +61,7 @@ class Selection:
         state: all fitted models; it is only read from here on.
         answer: the named model (`state.base` if no effect is named).
         rivals: {label of one of its effects: explanations that may take its place}.
-        subsets: {labels: the model with these of its effects}, every one refitted; {} of one effect or of too many.
+        subsets: {labels: the model with these of its effects}, every one refitted; {} of one effect or without time.
         promised: predicted share of the base model's gap that its effects close, {label: part}.
         chosen: {operating condition: effects that are named without it}.
         elsewhere: share of the gap closed on conditions that the choice was made without; NaN of one condition.
@@ -110,12 +109,12 @@ def select(
     names = np.unique(fitter.simulator.windows.group)
     chosen = {int(g): search.weighing.without(int(g)).answer for g in names} if len(names) > 1 and found.answer else {}
     answer = state.models[found.answer]
-    few = 1 < len(answer.effects) <= MANY and not settings.budget.over(LEAVING_OUT)
+    several = len(answer.effects) > 1 and not settings.budget.over(LEAVING_OUT)
     return Selection(
         state=state,
         answer=answer,
         rivals={e.label: tuple(_rivals(search.weighing, e, found)) for e in answer.effects},
-        subsets=_subsets(state, answer, say) if few else {},
+        subsets=_subsets(state, answer, say) if several else {},
         promised=promised(state, answer.effects) if answer.effects else (0.0, {}),
         chosen=chosen,
         elsewhere=_elsewhere(state, chosen),
@@ -220,18 +219,17 @@ def _linear(state: SearchState, effects: Sequence[Candidate]) -> tuple[Quadratic
     A = np.concatenate([fit.A, np.moveaxis(fit.r[None] - moved, 0, -1)], axis=2)
     q, _ = eliminate(fit.r, A, fit.B, fit.offsets, fitter.spread)
     known = fit.belief()
-    return q, np.array([*known, *(_precision(e, s) for e, s in pairs)]), np.array([_furthest(e, s) for e, s in pairs])
+    return (
+        q,
+        np.array([*known, *(_precision(e, s) for e, s in pairs)]),
+        np.array([room(e, _way(e, s))[1] for e, s in pairs]),
+    )
 
 
 def _precision(effect: Candidate, start: Array) -> float:
     return float(sum(c.precision * (s - c.neutral) ** 2 for c, s in zip(effect.coordinates, start, strict=True)))
 
 
-def _furthest(effect: Candidate, start: Array) -> float:
-    """The amount at which a coordinate reaches its bound."""
-    ends = [FURTHEST]
-    for c, s, shape in zip(effect.coordinates, start, effect.shapes, strict=True):
-        way = s - c.neutral
-        if way and not shape:
-            ends.append(((c.high if way > 0 else c.low) - c.neutral) / way)
-    return max(min(ends), 0.0)
+def _way(effect: Candidate, start: Array) -> Array:
+    """`[k]` from neutral to the start; 0 for shapes."""
+    return np.where(effect.shapes, 0.0, start - np.array([c.neutral for c in effect.coordinates]))

@@ -15,23 +15,11 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection.budget import Progress
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 from bayessim_mjx.diagnosis.selection.window_subset import looked_at, part
 from bayessim_mjx.diagnosis.statistics import times
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """How much is simulated."""
-
-    many: int = 400  # starting points, from which on a third of the windows has to do
-    fewest: int = 8  # of them, at least
-    worlds: int = 8192  # simulated between two signs of life, at most: whole calls, even of an accelerator
-    calls: int = 16  # and so many calls, at most
-
-
-SIZES = Sizes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,15 +122,14 @@ def screen(
     fitter: Fitter,
     fit: Fit,
     candidates: Sequence[Candidate],
-    limit: int = 96,
+    limit: int = EFFORT.windows,
     say: Progress = lambda text, done, total: None,
     secants: Secants | None = None,
     over: Callable[[], bool] | None = None,
 ) -> list[Screened]:
     """All candidates on top of `fit`, best first, on at most `limit` windows.
 
-    Where there are many starting points, a third of the windows has to do. Gains are scaled to all windows as if those
-    looked at were typical: good for ranking, too high as an estimate.
+    Gains are scaled to all windows as if those looked at were typical: good for ranking, too high as an estimate.
 
     Args:
         secants: what was simulated before; if empty, it is filled.
@@ -150,9 +137,7 @@ def screen(
     """
     secants = Secants() if secants is None else secants
     if not secants.columns:
-        count = sum(len(candidate.probes) for candidate in candidates)
-        some = limit if count <= SIZES.many else max(limit // 3, SIZES.fewest)
-        _fill(secants, fitter, fit, candidates, some, say, over)
+        _fill(secants, fitter, fit, candidates, limit, say, over)
     return _ordered(projected(fitter, fit, candidates, secants))
 
 
@@ -206,7 +191,7 @@ def simulated(
 ) -> Iterator[tuple[int, Array, Array]]:
     """(candidate, starting point, what it changes of the residual `[w, n]`) for plans of (candidate, point)."""
     some = part(fit, own)
-    at_once = max(min(SIZES.worlds, SIZES.calls * fitter.simulator.lanes) // len(own), 1)
+    at_once = max(EFFORT.batch * fitter.simulator.lanes // len(own), 1)  # whole calls of the compiled program
     for first in range(0, len(plans), at_once):
         if first and over is not None and over():
             return

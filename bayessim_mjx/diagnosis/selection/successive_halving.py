@@ -15,24 +15,20 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection import window_subset
 from bayessim_mjx.diagnosis.selection.budget import SINGLES, Progress
 from bayessim_mjx.diagnosis.selection.models import Key, Model, scored
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
-
-BATCH = 12  # models that are fitted in lockstep; `state.keep` is called after each batch
 
 
 class SuccessiveHalving:
     """Starts far behind their candidate's best stop first, then candidates far behind the best candidate.
 
-    A fit that stops keeps the cost that it reached. A fit goes on if its cost still falls fast, or if a step that
-    promised much was refused.
+    After n steps a start has to be within 1 + (c - 1) / c^(n - 1) times its candidate's best cost, c = `Effort.close`,
+    and within c times that limit of the best candidate's: where it is, or after one more step like its last. A fit that
+    stops keeps the cost that it reached.
 
     Args:
         over: whether the time is over.
     """
-
-    STARTS = {1: 4.0, 2: 2.0, 3: 1.3, 5: 1.03}  # steps made -> cost over the best start's
-    CANDIDATES = {2: 8.0, 3: 5.0, 5: 3.0}  # and over the best candidate's
-    FAST = 0.7  # cost after over cost before a step
 
     def __init__(self, over: Callable[[], bool]) -> None:
         self.over = over
@@ -49,16 +45,15 @@ class SuccessiveHalving:
             cost = np.array([fit.cost for fit in fits])
             best = np.array([float(np.min(cost[owner == i])) for i in range(len(starts))])
             self.pace[made] = min(self.pace.get(made, np.inf), float(best.min()))
-            limits = self.STARTS.get(made, np.inf) * best
-            if made in self.CANDIDATES:
-                limits[best > self.CANDIDATES[made] * self.pace[made]] = 0.0
-            return [i for i in running if cost[i] <= limits[owner[i]] or self._falls(fits[i])]
+            behind = 1.0 + (EFFORT.close - 1.0) / EFFORT.close ** (made - 1)
+            limits = behind * np.minimum(best, EFFORT.close * self.pace[made])
+            return [i for i in running if made < 1 or min(cost[i], _next(fits[i])) <= limits[owner[i]]]
 
         return going
 
     def learn(self, fits: Sequence[Fit]) -> None:
         """Take the pace from finished fits. Fits that are read from disk set the same pace as fits that were run."""
-        for made in self.CANDIDATES:
+        for made in range(1, EFFORT.steps + 1):
             costs = [fit.history[min(made, len(fit.history) - 1)] for fit in fits if fit.history]
             self.pace[made] = min([self.pace.get(made, np.inf), *costs])
 
@@ -70,10 +65,13 @@ class SuccessiveHalving:
 
         return going
 
-    def _falls(self, fit: Fit) -> bool:
-        refused = len(fit.history) > 1 and fit.history[-1] == fit.history[-2]
-        fell = len(fit.history) > 1 and fit.history[-1] < self.FAST * fit.history[-2]
-        return fell or (refused and fit.promise > (1 - self.FAST) * fit.cost)
+
+def _next(fit: Fit) -> float:
+    """Cost after one more step that gains the same factor as the last, or what was promised if that was refused."""
+    if len(fit.history) < 2:
+        return np.inf
+    before, now = fit.history[-2:]
+    return fit.cost - fit.promise if before == now else now**2 / before
 
 
 Entries = dict[Key, tuple[list[Fit], tuple[Candidate, ...]]]  # {labels: (a fit per start, effects)}
@@ -100,8 +98,8 @@ def fit_entries(
     every = list(entries.items())
     leading = min((model.fit for model in parents.values()), key=lambda fit: fit.cost, default=state.base.fit)
     own = window_subset.windows_of(leading)
-    for first in range(0, len(every), BATCH):
-        some = dict(every[first : first + BATCH])
+    for first in range(0, len(every), EFFORT.batch):
+        some = dict(every[first : first + EFFORT.batch])
         if part and state.settings.budget.over(part) and (first or part != SINGLES):
             _left_out(state, [effects for _, (_, effects) in every[first:]], label)
             return
@@ -126,7 +124,7 @@ def _fit_batch(
     every = [several for several, _ in entries.values()]
     part = state.fitter if own is None else window_subset.on(state.fitter, own)
     starts = [f if own is None else window_subset.cut(f, own) for fs in every for f in fs]
-    rules = state.settings.iterations, state.fresh, state.settings.tolerance
+    rules = state.settings.iterations, state.fresh, EFFORT.tolerance
     fits = part.iterate(starts, *rules, progress, halving.among(list(map(len, every))))
     halving.learn(fits)
     rest = iter(fits)

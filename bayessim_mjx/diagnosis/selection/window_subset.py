@@ -5,7 +5,7 @@ All windows are needed to say how well a model predicts, fewer to see that it is
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,28 +13,9 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.journal import Remembering
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """How many windows candidates are ranked on, and which of them go on with all windows.
-
-    Rules of thumb: on one case they cost half the simulations (131 360 windows in place of 239 872) and name the same
-    (46e2ef7); error rates were not counted.
-
-    Attributes:
-        windows: in the subset; least: number of all windows from which on a subset is used.
-        close: times the best candidate's cost on the subset; others make one step on all windows, for the ranking.
-    """
-
-    windows: int = 24
-    least: int = 48
-    close: float = 4.0
-
-
-SIZES = Sizes()
 
 
 class WindowSubset:
@@ -70,7 +51,7 @@ def part(fit: Fit, own: NDArray[np.int64]) -> Fit:
 
 def windows_of(fit: Fit) -> NDArray[np.int64] | None:
     """The windows on which extensions of a fit are ranked; None: all, as there are few."""
-    return looked_at(fit, SIZES.windows) if len(fit.r) >= SIZES.least else None
+    return looked_at(fit, EFFORT.windows // 2) if len(fit.r) >= EFFORT.windows else None
 
 
 def on(fitter: Fitter, own: NDArray[np.int64]) -> Fitter:
@@ -101,4 +82,4 @@ def back(fit: Fit, ranked: Fit, own: NDArray[np.int64]) -> Fit:
 
 def close(costs: Array, least: float) -> NDArray[np.bool_]:
     """Which candidates go on: those whose cost is close to the least so far."""
-    return np.asarray(costs <= SIZES.close * least)
+    return np.asarray(costs <= EFFORT.close * least)

@@ -10,9 +10,10 @@ from scipy.special import logsumexp
 
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY, SURE
 from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, marginal
-from bayessim_mjx.diagnosis.evidence.parameters import SIZES, belief_of, integrated
+from bayessim_mjx.diagnosis.evidence.parameters import belief_of, integrated
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
+from bayessim_mjx.diagnosis.selection.numbers import PRIORS
 from tests.diagnosis.evidence.linear import draw
 
 HYPER = Hyper(np.array([0.02]), 4.0, np.array([1.0, 1.2]))
@@ -116,7 +117,7 @@ def test_an_effect_of_any_size_against_quadrature(truth):
     top = max(likelihood(there, p) for p in np.linspace(0, 2, 2001))
 
     def density(p):
-        return np.mean([stats.truncnorm(0.0, 1.0 / size, scale=20.0 * size).pdf(p) for size in SIZES])
+        return np.mean([stats.truncnorm(0.0, 1.0 / size, scale=20.0 * size).pdf(p) for size in PRIORS.sizes])
 
     whole = integrate.quad(lambda p: density(p) * np.exp(likelihood(there, p) - top), 0, 2, limit=400)[0]
     found = integrated(fit, learnt, [{0: False}])
@@ -137,14 +138,14 @@ def test_a_number_of_an_effect_may_be_neutral(truth, shapes):
     there = marginal(case.windows(), HYPER)
     learnt = Learnt(HYPER, belief_of(whole).best(there.Q.sum(0)), there, 0.0)
     each = []
-    for n, size in itertools.product((1, 2, 3), SIZES):
+    for n, size in itertools.product((1, 2, 3), PRIORS.sizes):
         sized = [c if i in (0, *shapes) else replace(c, precision=size**-2) for i, c in enumerate(numbers)]
         for some in itertools.combinations((1, 2, 3), n):
             if not {*some} <= {*shapes}:
                 own = [0, *some]
                 each.append(evidence(case, fitted([sized[i] for i in own], np.zeros(len(own))), own)[0].nats)
     found = integrated(whole, learnt, [{i: i in shapes for i in (1, 2, 3)}])
-    assert len(each) == len(SIZES) * {0: 7, 1: 6, 2: 4}[len(shapes)]
+    assert len(each) == len(PRIORS.sizes) * {0: 7, 1: 6, 2: 4}[len(shapes)]
     assert found.nats == pytest.approx(logsumexp(each) - np.log(len(each)), abs=1e-3)
     gained = found.nats - integrated(whole, learnt).nats
     assert gained > 1.0 if truth[1] == 0 else gained < 0.0

@@ -24,7 +24,7 @@ def fitted(true=0.4, starts=(0.9, 0.1, 0.6)):
 
 def test_fits_on_some_windows_come_to_those_on_all_of_them(monkeypatch):
     whole, many = fitted()
-    monkeypatch.setattr(window_subset, "SIZES", dataclasses.replace(window_subset.SIZES, windows=2, least=8))
+    monkeypatch.setattr(window_subset, "EFFORT", dataclasses.replace(window_subset.EFFORT, windows=4))
     some, fewer = fitted()
     assert fewer < 0.8 * many
     assert some.fit.values == pytest.approx(whole.fit.values, abs=1e-4)
@@ -32,7 +32,7 @@ def test_fits_on_some_windows_come_to_those_on_all_of_them(monkeypatch):
 
 
 def test_what_gains_less_than_its_prior_odds_on_some_windows_is_no_model(monkeypatch):
-    monkeypatch.setattr(window_subset, "SIZES", dataclasses.replace(window_subset.SIZES, windows=2, least=8))
+    monkeypatch.setattr(window_subset, "EFFORT", dataclasses.replace(window_subset.EFFORT, windows=4))
     kept = {}
     for true in (0.0, 0.4):  # without the effect, and with it
         pool, model = pool_of(true)
