@@ -4,7 +4,7 @@
         [--workers N] [--minutes M] [--folder runs/sensitivity] [--page docs/decisions/numbers.md]
 
 Numbers are those of `bayessim_mjx.diagnosis.selection.numbers`, as `Priors.least` or `HIDDEN`, or `MODULE:NAME` for one
-of another module of the diagnosis. A number is replaced in the text of its module before anything imports it, so what is
+of another module of the diagnosis. A number is replaced in the text of its module before anything imports it: what is
 derived from it changes too. Whole numbers are rounded, and at least 1. Of a tuple each entry but 1 is changed. Of a
 number around 1, which stands for no difference, its distance from 1 is halved or doubled.
 
@@ -255,7 +255,7 @@ def _probability(said: dict[str, Any], names: Sequence[str]) -> float:
 
 def record(folder: Path, cases: Sequence[str], chosen: Sequence[str], commit: str, command: str) -> dict[str, Any]:
     """The record: a row for each number and factor, counts over the cases that have ended."""
-    rows, seen = [], set()
+    rows, seen = [], set[str]()
     unchanged = {c: s for c in cases if (s := _said(folder / c / UNCHANGED))}
     for number in chosen:
         for word, factor in FACTORS.items():
@@ -282,7 +282,7 @@ def record(folder: Path, cases: Sequence[str], chosen: Sequence[str], commit: st
         "command": command,
         "machine": "one core a run",
         "shown": "no",
-        "note": f"Cases: {', '.join(c for c in cases if c in seen)}. Probability: of the set that the unchanged run names.",
+        "note": f"Cases: {', '.join(c for c in cases if c in seen)}. Probability: of the unchanged run's answer.",
         "columns": ["number", "value", "changed to", "cases", "verdicts that change", "effects that change",
                     f"probabilities that move by more than {MOVED}", "largest move", "CPU, median ratio", "which"],
         "table": rows,

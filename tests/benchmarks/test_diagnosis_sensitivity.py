@@ -23,7 +23,7 @@ def test_halved_and_doubled(value, factor, new):
 
 
 def test_a_planted_number_is_in_everything_that_is_derived_from_it():
-    """The median of the missing force is the root of its least amplitude; a limit that search imports is the new one."""
+    """The median of the missing force is the root of its least amplitude; words read the new limit of noise."""
     code = (
         "import sys; sys.path[:0] = [sys.argv[1]]; import sensitivity\n"
         "sensitivity.plant('Priors.least', 1e-6); sensitivity.plant('gap:AT_NOISE', 7.0)\n"

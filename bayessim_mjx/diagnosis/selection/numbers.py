@@ -82,7 +82,7 @@ class Effort:
         rounds: of whatever is repeated until it gains nothing, at most.
         margin: nats below the leading set, within which a promised set is fitted.
         windows: that screening simulates. Half of them rank starts, where there are as many.
-        points: starting points of a candidate that a look at a set simulates; candidates: that it simulates.
+        points: starting points of a candidate that a look at a set simulates.
         steps: of a fit at most; tolerance: share of its cost that a step has to gain, and nats close to its end.
         close: times the best cost, up to which a fit on some windows goes on.
     """
@@ -92,7 +92,6 @@ class Effort:
     margin: float = 30.0
     windows: int = 48
     points: int = 3
-    candidates: int = 16
     steps: int = 12
     tolerance: float = 5e-3
     close: float = 4.0
@@ -101,6 +100,11 @@ class Effort:
     def batch(self) -> int:
         """Models that are fitted in lockstep; the state is kept after each batch."""
         return sum(self.sets)
+
+    @property
+    def candidates(self) -> int:
+        """Candidates that a look at a set simulates: as many starting points as windows."""
+        return self.windows // self.points
 
 
 PRIORS, RELEVANCE, ODDS, EFFORT = Priors(), Relevance(), Odds(), Effort()

@@ -9,6 +9,7 @@ from scipy import integrate, stats
 from scipy.special import logsumexp
 
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY, SURE
+from bayessim_mjx.diagnosis.evidence import parameters
 from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, marginal
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of, integrated
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
@@ -149,3 +150,12 @@ def test_a_number_of_an_effect_may_be_neutral(truth, shapes):
     assert found.nats == pytest.approx(logsumexp(each) - np.log(len(each)), abs=1e-3)
     gained = found.nats - integrated(whole, learnt).nats
     assert gained > 1.0 if truth[1] == 0 else gained < 0.0
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.3, 3.0, 100.0, 1e6])
+def test_the_depth_of_a_layer_beside_a_bound(slope):
+    """Against quadrature; far from the bound it is that of an exponential density, sqrt(2) / slope."""
+    curvature, end = 4.0, min(10.0, 50.0 / max(slope, 1e-9))
+    weight = [integrate.quad(lambda t, n=n: t**n * np.exp(-slope * t - 2.0 * t * t), 0, end)[0] for n in (0, 2)]
+    assert parameters._depth(-slope, curvature) == pytest.approx(np.sqrt(weight[1] / weight[0]), rel=1e-6)
+    assert slope < 1e3 or parameters._depth(slope, curvature) == pytest.approx(np.sqrt(2) / slope, rel=1e-6)

@@ -104,7 +104,7 @@ class Slow:
     ("limit", "steps", "refreshed", "windows"), [(630.0, 9, 1, 11), (1e9, 24, 2, 20), (4000.0, 24, 2, 20)]
 )
 def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(monkeypatch, limit, steps, refreshed, windows):
-    """Twelve steps twice where there is time for them; a seventh of 630 s is nine. Windows are then screened in time."""
+    """Twelve steps twice where there is time for them; a seventh of 630 s is nine. Windows are then as time allows."""
     fitter, seen = Slow(), {}
     settings = Settings(budget=Budget(limit, 0.0, lambda: fitter.seconds), screened=20)
     candidates = [SimpleNamespace(probes=np.zeros((40, 1)))] * 2

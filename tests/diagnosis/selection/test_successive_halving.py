@@ -19,7 +19,11 @@ def test_starts_behind_their_own_best_stop_and_candidates_far_behind_the_best():
     slow = [fit(10, 10), fit(41, 39), fit(42.5, 42), fit(150, 149)]
     assert going(1, slow, range(4)) == [0, 1, 3]
     assert going(2, slow, range(4)) == [0]  # 1.75 times the best start, seven times the best candidate
-    assert going(2, [fit(10, 10), fit(40, 26), fit(41, 27), fit(90, 80)], range(4)) == [0, 1, 2]  # 26^2 / 40 is 16.9
+    assert going(2, [fit(10, 10), fit(40, 26), fit(41, 26.7), fit(90, 80)], range(4)) == [
+        0,
+        1,
+        2,
+    ]  # 26.7^2 / 41 is 17.4
     assert SuccessiveHalving(lambda: True).among([1])(1, [fit(1, 1)], [0]) == []
 
 
