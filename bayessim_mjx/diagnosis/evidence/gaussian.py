@@ -54,6 +54,11 @@ class Windows:
     def forces(self) -> int:
         return self.joints * self.nodes
 
+    @property
+    def memories(self) -> list[float]:
+        """Of the force that are tried, in node spacings: powers of 4, from white to the length of a window."""
+        return [4.0**n for n in range((1 + self.nodes.bit_length()) // 2)]
+
     def some(self, rows: NDArray[np.bool_]) -> Windows:
         """Some of the windows."""
         return replace(self, gram=self.gram[:, rows])
@@ -93,11 +98,6 @@ class Marginal:
     root: Array
     cov: Array
     mean: Array
-
-
-def memories_of(nodes: int) -> list[float]:
-    """Memories that are tried, in node spacings: powers of 4, from white to the length of a window."""
-    return [4.0**n for n in range(1 + int(np.log(nodes) / np.log(4.0)))]
 
 
 def correlation(nodes: int, memory: float) -> Array:
@@ -177,7 +177,7 @@ def learn(windows: Windows, belief: Belief, like: Sequence[Hyper] = ()) -> Learn
     """
     nv, channels = windows.joints, len(windows.gram)
     starts = [np.concatenate([np.full(nv, np.log(PRIORS.usual)), np.zeros(channels)])]
-    memories = memories_of(windows.nodes)
+    memories = windows.memories
     if like:
         starts, memories = [np.log(np.concatenate([h.amplitude, h.noise])) for h in like], [like[0].memory]
     start = min(starts, key=lambda x: _slope(x, windows, belief, memories[0])[0]) if len(starts) > 1 else starts[0]

@@ -24,9 +24,8 @@ from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, HIDDEN, ODDS
-from bayessim_mjx.diagnosis.selection.screen import Projection, judged, projected, simulated
+from bayessim_mjx.diagnosis.selection.screen import Projection, judged, looked_at, part, projected, simulated
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
-from bayessim_mjx.diagnosis.selection.window_subset import looked_at, part
 
 Array = NDArray[np.float64]
 AMOUNTS = np.linspace(0.0, 1.0, 101)[1:]  # of an effect, shares of the largest in its range

@@ -23,8 +23,7 @@ from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Key
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, PRIORS
-from bayessim_mjx.diagnosis.selection.screen import room, simulated
-from bayessim_mjx.diagnosis.selection.window_subset import looked_at
+from bayessim_mjx.diagnosis.selection.screen import looked_at, room, simulated
 
 Array = NDArray[np.float64]
 

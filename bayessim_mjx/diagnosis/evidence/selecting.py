@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.evidence import masked_effects
 from bayessim_mjx.diagnosis.evidence.laws import compatible, special_cases
+from bayessim_mjx.diagnosis.evidence.promises import Column
 from bayessim_mjx.diagnosis.evidence.search import Search
 from bayessim_mjx.diagnosis.evidence.sets import Weighed
 from bayessim_mjx.diagnosis.evidence.weighing import Estimated, Size, Weighing, at_its_mean, estimated, size_in
@@ -23,7 +24,6 @@ from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
 from bayessim_mjx.diagnosis.selection.fits import begin, cut_back
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model
-from bayessim_mjx.diagnosis.selection.screen import room
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings
 from bayessim_mjx.diagnosis.selection.successive_halving import Entries, fit_entries
 from bayessim_mjx.diagnosis.statistics import shapley
@@ -216,20 +216,8 @@ def _linear(state: SearchState, effects: Sequence[Candidate]) -> tuple[Quadratic
     pairs = list(zip(effects, starts, strict=True))
     thetas = [fitter.vector((*fit.coordinates, *e.coordinates), np.concatenate([fit.values, s])) for e, s in pairs]
     moved = fitter.whiten(fitter.simulator.run(np.stack(thetas), np.repeat(fit.offsets[None], len(thetas), 0)))
-    A = np.concatenate([fit.A, np.moveaxis(fit.r[None] - moved, 0, -1)], axis=2)
+    columns = [Column(*pair, fit.r - own) for pair, own in zip(pairs, moved, strict=True)]
+    A = np.concatenate([fit.A, *(c.change[..., None] for c in columns)], axis=2)
     q, _ = eliminate(fit.r, A, fit.B, fit.offsets, fitter.spread)
-    known = fit.belief()
-    return (
-        q,
-        np.array([*known, *(_precision(e, s) for e, s in pairs)]),
-        np.array([room(e, _way(e, s))[1] for e, s in pairs]),
-    )
-
-
-def _precision(effect: Candidate, start: Array) -> float:
-    return float(sum(c.precision * (s - c.neutral) ** 2 for c, s in zip(effect.coordinates, start, strict=True)))
-
-
-def _way(effect: Candidate, start: Array) -> Array:
-    """`[k]` from neutral to the start; 0 for shapes."""
-    return np.where(effect.shapes, 0.0, start - np.array([c.neutral for c in effect.coordinates]))
+    precision, most = [c.precision for c in columns], [c.room[1] for c in columns]
+    return q, np.array([*fit.belief(), *precision]), np.array(most)

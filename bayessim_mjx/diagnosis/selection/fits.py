@@ -123,14 +123,9 @@ def _to_the_end(state: SearchState, fits: Sequence[Fit], counted: Callable[[Fit]
 
 def _again(state: SearchState, fit: Fit) -> Fit:
     """A fit with contacts, from its own start states and from the measured ones; the better of both."""
-    both = {id(f): f for f in (fit, state.begun(fit))}
-    return min((_on(state.fitter, f) for f in both.values()), key=lambda f: f.cost)
-
-
-def _on(fitter: Fitter, fit: Fit) -> Fit:
-    every = range(len(fit.coordinates))
-    (fit,) = fitter.iterate([replace(fit, history=())], EFFORT.steps, lambda f: every, EFFORT.tolerance)
-    return fitter.refresh(fit)
+    both = {id(f): replace(f, history=()) for f in (fit, state.begun(fit))}
+    found = state.fitter.iterate(list(both.values()), EFFORT.steps, lambda f: range(len(f.values)), EFFORT.tolerance)
+    return min(map(state.fitter.refresh, found), key=lambda f: f.cost)
 
 
 def cut_back(state: SearchState, model: Model, kept: Sequence[Candidate]) -> Fit:

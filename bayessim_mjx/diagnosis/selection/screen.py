@@ -16,7 +16,6 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT
-from bayessim_mjx.diagnosis.selection.window_subset import looked_at, part
 from bayessim_mjx.diagnosis.statistics import times
 
 Array = NDArray[np.float64]
@@ -41,6 +40,22 @@ class Screened:
     column: Array
     others: tuple[Array, ...] = ()
     whole: float = 0.0
+
+
+def looked_at(fit: Fit, limit: int) -> NDArray[np.int64]:
+    """At most `limit` windows: half with the largest residuals (a limit acts in few), the others spread evenly."""
+    count = len(fit.r)
+    if count <= limit:
+        return np.arange(count)
+    worst = np.argsort(-np.sum(fit.r**2, 1), kind="stable")[: limit // 2]
+    others = np.setdiff1d(np.arange(count), worst)
+    spread = others[np.linspace(0, len(others) - 1, limit - len(worst)).round().astype(int)]
+    return np.sort(np.concatenate([worst, spread]))
+
+
+def part(fit: Fit, own: NDArray[np.int64]) -> Fit:
+    """The fit on some of its windows."""
+    return replace(fit, offsets=fit.offsets[own], r=fit.r[own], A=fit.A[own], B=fit.B[own], weight=fit.weight[own])
 
 
 class Projection:

@@ -1,22 +1,31 @@
-"""Successive halving: many fits run in lockstep, those far behind stop early, those close to the best go to the end."""
+"""Successive halving: many fits run in lockstep, those far behind stop early, those close to the best go to the end.
+
+Starts and candidates are ranked on some of the windows, and the best go on with all. All windows are needed to say how
+well a model predicts, fewer to see that it is far behind.
+"""
 
 from __future__ import annotations
 
 import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.selection import window_subset
+from bayessim_mjx.diagnosis.fitting.journal import Remembering
 from bayessim_mjx.diagnosis.selection.budget import SINGLES, Progress
 from bayessim_mjx.diagnosis.selection.models import Key, Model, scored
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT
+from bayessim_mjx.diagnosis.selection.screen import looked_at, part
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
+
+Array = NDArray[np.float64]
 
 
 class SuccessiveHalving:
@@ -97,7 +106,7 @@ def fit_entries(
     total, done = sum(len(several) for several, _ in entries.values()), 0
     every = list(entries.items())
     leading = min((model.fit for model in parents.values()), key=lambda fit: fit.cost, default=state.base.fit)
-    own = window_subset.windows_of(leading)
+    own = ranked_on(leading)
     for first in range(0, len(every), EFFORT.batch):
         some = dict(every[first : first + EFFORT.batch])
         if part and state.settings.budget.over(part) and (first or part != SINGLES):
@@ -122,8 +131,8 @@ def _fit_batch(
 ) -> None:
     """All starts on a subset of the windows (None: on all); then the best start of each model on all windows."""
     every = [several for several, _ in entries.values()]
-    part = state.fitter if own is None else window_subset.on(state.fitter, own)
-    starts = [f if own is None else window_subset.cut(f, own) for fs in every for f in fs]
+    part = state.fitter if own is None else fitter_on(state.fitter, own)
+    starts = [f if own is None else cut(f, own) for fs in every for f in fs]
     rules = state.settings.iterations, state.fresh, EFFORT.tolerance
     fits = part.iterate(starts, *rules, progress, halving.among(list(map(len, every))))
     halving.learn(fits)
@@ -135,8 +144,8 @@ def _fit_batch(
         gaining = _gaining(state, part, own, best, parents)
         state.vain |= set(entries) - set(gaining)
         halving.least = min(halving.least, *(fit.cost for fit in best.values()))
-        again = [window_subset.back(first[key][1], best[key], own) for key in gaining]
-        close = window_subset.close(np.array([best[key].cost for key in gaining]), halving.least)
+        again = [back(first[key][1], best[key], own) for key in gaining]
+        close = np.array([best[key].cost for key in gaining]) <= EFFORT.close * halving.least
         found = state.fitter.iterate(again, *rules, None, halving.finals(close)) if again else []
         best = dict(zip(gaining, found, strict=True))
     for key, fit in best.items():
@@ -150,7 +159,7 @@ def _gaining(
     share, out = len(own) / len(state.base.fit.r), []
     for key, fit in fits.items():
         parent = parents.get(key)
-        before = np.inf if parent is None else window_subset.cost(part, parent.fit, own)
+        before = np.inf if parent is None else cost_on(part, parent.fit, own)
         if before - fit.cost > share * _least_gain(state, key, parent):
             out.append(key)
     return out
@@ -166,3 +175,49 @@ def _left_out(state: SearchState, models: Sequence[Sequence[Candidate]], label: 
     """Record the models for which no time was left."""
     state.cut_short.update(effects[0].label for effects in models if len(effects) == 1)
     state.skipped[label] = state.skipped.get(label, 0) + len(models)
+
+
+class WindowSubset:
+    """A simulator of the windows `own` of another, for a fitter; both share one compiled program."""
+
+    def __init__(self, simulator: Any, own: NDArray[np.int64]) -> None:
+        self.simulator, self.own, self.physics = simulator, own, simulator.physics
+        self.apart = getattr(simulator, "apart", False)
+        all_of_it = simulator.windows  # its batch stays whole: the simulator has it
+        parts = {name: getattr(all_of_it, name)[own] for name in ("log", "start", "group")}
+        self.windows = replace(all_of_it, **parts)
+
+    def run(self, thetas: Array, offsets: Array | None = None, windows: NDArray[np.int64] | None = None) -> Array:
+        """As `Simulator.run`."""
+        return np.asarray(self.simulator.run(thetas, offsets, self.own if windows is None else self.own[windows]))
+
+
+def ranked_on(fit: Fit) -> NDArray[np.int64] | None:
+    """The windows on which extensions of a fit are ranked; None: all, as there are few."""
+    return looked_at(fit, EFFORT.windows // 2) if len(fit.r) >= EFFORT.windows else None
+
+
+def fitter_on(fitter: Fitter, own: NDArray[np.int64]) -> Fitter:
+    """The fitter on some of its windows; it uses the same journal, but stores no columns there."""
+    some: Any = WindowSubset(fitter.simulator, own)
+    plain = Fitter(some, fitter.base, fitter.theta)
+    journal = fitter.journal if isinstance(fitter, Remembering) else None
+    return plain if journal is None else Remembering(plain, journal, bare=True)
+
+
+def cut(fit: Fit, own: NDArray[np.int64]) -> Fit:
+    """The start of a fit to some of the windows."""
+    return replace(part(fit, own), cost=np.inf, history=(), reach=np.ones(1))
+
+
+def cost_on(part: Fitter, fit: Fit, own: NDArray[np.int64]) -> float:
+    """The cost on some windows of a fit to all windows."""
+    some = cut(fit, own)
+    return part.cost(some, some.r, some.offsets, some.values)
+
+
+def back(fit: Fit, ranked: Fit, own: NDArray[np.int64]) -> Fit:
+    """The start of a fit to all windows at the values of `ranked`, a fit to some; its first step gives residuals."""
+    offsets = fit.offsets.copy()
+    offsets[own] = ranked.offsets
+    return replace(fit, values=ranked.values, offsets=offsets, cost=np.inf, history=(), reach=np.ones(1))
