@@ -301,6 +301,13 @@ def _short(value: Any) -> str:
     return ", ".join(f"{x:.4g}" for x in (value if isinstance(value, tuple) else (value,)))
 
 
+def written(found: dict[str, Any]) -> str:
+    """The record as JSON, a line for each field and each row of the table."""
+    fields = [f" {json.dumps(k)}: {json.dumps(v, ensure_ascii=False)}" for k, v in found.items() if k != "table"]
+    rows = ",\n".join(f"  {json.dumps(row, ensure_ascii=False)}" for row in found["table"])
+    return "{\n" + ",\n".join(fields) + f',\n "table": [\n{rows}\n ]\n}}\n'
+
+
 def paged(text: str, found: dict[str, Any]) -> str:
     """A page whose table has the counts in its last two cells: of each number its first cell, in backticks, names."""
     rows = {row[0]: row for row in found["table"]}
@@ -357,7 +364,7 @@ def main() -> None:
         )
         shown = f"python benchmarks/diagnosis/sensitivity.py --cases {args.cases} --numbers {args.numbers} --out FILE"
         found = record(args.folder, names, chosen, commit, shown)
-        args.out.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        args.out.write_text(written(found), encoding="utf-8")
         if args.page is not None:
             args.page.write_text(paged(args.page.read_text(encoding="utf-8"), found), encoding="utf-8")
 

@@ -58,6 +58,7 @@ def test_the_record_counts_what_changes_and_the_page_shows_it(tmp_path):
     (row,) = found["table"]  # nothing has ended with it doubled
     counts = ["2", "1", "1", "1", "0.40", "1.00", "one"]
     assert row == ["Odds.strong halved", "20", "10", *counts] and len(row) == len(found["columns"])
+    assert json.loads(sensitivity.written(found)) == found
     page = "| `Odds.strong` | 20 | what | | |\n| `Odds.mention` | 3 | what | | |"
     assert sensitivity.paged(page, found).split("\n") == [
         "| `Odds.strong` | 20 | what | 1, 1, 1 of 2 | the same number |", "| `Odds.mention` | 3 | what | | |",

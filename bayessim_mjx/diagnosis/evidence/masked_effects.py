@@ -38,7 +38,8 @@ def by_effects(state: SearchState, answer: Model, say: Progress = lambda text, d
     others = [c for c in state.candidates if c.label in state.secants.columns]
     others = [c for c in others if all(compatible(c, e) for e in answer.effects)]
     alone, likely = _shown(state, state.base, others), _shown(state, answer, others)
-    some = [c for c in others if alone[c.label][0][0] < min(HIDDEN, likely[c.label][0][0])]
+    shown = 1.0 - (1.0 - HIDDEN) ** 0.5  # halfway, on a log scale, between what is hidden and what shows wholly
+    some = [c for c in others if alone[c.label][0][0] < shown < likely[c.label][0][0]]
     some = sorted(some, key=lambda c: -likely[c.label][0][0])[: EFFORT.candidates]
     plans = [(i, point) for i, c in enumerate(some) for _, point in likely[c.label][: EFFORT.points]]
     own = looked_at(answer.fit, state.settings.screened)
