@@ -130,8 +130,9 @@ def one(folder: Path) -> None:
         worker.without_pictures()
         began = time.process_time()
         words = ["--model", made / "model.xml", "--data", made / "logs", "--out", folder / "diagnosis", "--seed", "0"]
-        result["code"], seconds, _ = worker.watched([*map(str, words), "--headless", "--verdict_only"])
+        result["code"], seconds, found = worker.watched([*map(str, words), "--headless", "--verdict_only"])
         result |= seconds | {"cpu": time.process_time() - began}
+        result["simulated"] = found.setup.fitter.simulator.rollouts if found else None
         file = folder / "diagnosis" / "diagnosis.json"
         result["said"] = _answer(json.loads(file.read_text())) if file.exists() else None
     except Exception:
@@ -264,12 +265,12 @@ def record(folder: Path, cases: Sequence[str], chosen: Sequence[str], commit: st
                 continue
             seen |= set(found)
             each = {c: compared(before[0], now[0]) for c, (before, now) in found.items()}
-            times = sorted(now[1] / before[1] for before, now in found.values())
+            effort = sorted(now[1] / before[1] for before, now in found.values())
             counts = [
                 *(str(sum(e[i] for e in each.values())) for i in (0, 1)),
                 str(sum(abs(e[2]) > MOVED for e in each.values())),
                 f"{max(abs(e[2]) for e in each.values()):.2f}",
-                f"{times[len(times) // 2]:.2f}",
+                f"{effort[len(effort) // 2]:.2f}",
             ]
             which = ", ".join(c for c, e in each.items() if e[0] or e[1])
             to = changed(value_of(number), factor)
@@ -284,17 +285,17 @@ def record(folder: Path, cases: Sequence[str], chosen: Sequence[str], commit: st
         "shown": "no",
         "note": f"Cases: {', '.join(c for c in cases if c in seen)}. Probability: of the unchanged run's answer.",
         "columns": ["number", "value", "changed to", "cases", "verdicts that change", "effects that change",
-                    f"probabilities that move by more than {MOVED}", "largest move", "CPU, median ratio", "which"],
+                    f"probabilities that move by more than {MOVED}", "largest move", "simulated windows, ratio", "which"],
         "table": rows,
     }  # fmt: skip
 
 
-def _said(folder: Path) -> tuple[dict[str, Any], float] | None:
-    """(answer, CPU seconds) of a run that has ended."""
+def _said(folder: Path) -> tuple[dict[str, Any], int] | None:
+    """(answer, simulated windows) of a run that has ended."""
     if not (folder / RESULT).exists():
         return None
     result = json.loads((folder / RESULT).read_text())
-    return (result["said"], result["cpu"]) if result.get("said") else None
+    return (result["said"], result["simulated"]) if result.get("said") else None
 
 
 def _short(value: Any) -> str:

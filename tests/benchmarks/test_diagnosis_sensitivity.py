@@ -42,17 +42,23 @@ def test_no_such_number():
         sensitivity.value_of("Priors.lest")
 
 
-def said(folder, verdict, effects, sets, cpu=10.0):
+def said(folder, verdict, effects, sets, simulated=1000):
     folder.mkdir(parents=True)
     answer = {"verdict": verdict, "effects": effects, "sets": sets}
-    (folder / "result.json").write_text(json.dumps({"said": answer, "cpu": cpu}))
+    (folder / "result.json").write_text(json.dumps({"said": answer, "simulated": simulated}))
 
 
 def test_the_record_counts_what_changes_and_the_page_shows_it(tmp_path):
     both = {"a@x": 0.7, "a@x + b@y": 0.25}
     said(tmp_path / "one" / "unchanged", "effects", ["a@x"], both)
     said(tmp_path / "two" / "unchanged", "no_gap", [], {"": 0.9})
-    said(tmp_path / "one" / "Odds.strong_halved", "ambiguous", ["a@x", "b@y"], {"b@y + a@x": 0.5, "a@x": 0.3}, cpu=5.0)
+    said(
+        tmp_path / "one" / "Odds.strong_halved",
+        "ambiguous",
+        ["a@x", "b@y"],
+        {"b@y + a@x": 0.5, "a@x": 0.3},
+        simulated=500,
+    )
     said(tmp_path / "two" / "Odds.strong_halved", "no_gap", [], {"": 0.85})
     found = sensitivity.record(tmp_path, ["one", "two", "three"], ["Odds.strong"], "abc", "command")
     (row,) = found["table"]  # nothing has ended with it doubled
