@@ -174,13 +174,13 @@ class Search:
     def _possible(self) -> None:
         """The answer with one effect more that may do the work of a known parameter.
 
-        The logs do not need it, so it changes no name. It widens the interval of the parameter.
+        The logs do not need it, so it changes no name. It widens the interval of the parameter. A fit of before began
+        at the parameter as it is, and may rest there.
         """
         key = self.weighing.weighed().answer
-        some = [s for s in stand_ins(self.state, self.state.models[key]) if self._new(key | {s.candidate.label})]
         plans = [
             Plan(key | {s.candidate.label}, np.inf, key, (s.column,), (1.0,), (s.point,), key, (s.known,))
-            for s in sorted(some, key=lambda s: -s.nats)[: EFFORT.sets[0]]
+            for s in sorted(stand_ins(self.state, self.state.models[key]), key=lambda s: -s.nats)[: EFFORT.sets[0]]
         ]
         if plans and not self.state.settings.budget.over(TOGETHER):
             self._fit(plans, "beside known parameters", TOGETHER)
