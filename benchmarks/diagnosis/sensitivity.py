@@ -283,9 +283,9 @@ def record(folder: Path, cases: Sequence[str], chosen: Sequence[str], commit: st
         "command": command,
         "machine": "one core a run",
         "shown": "no",
-        "note": f"Windows: simulated. Cases: {', '.join(c for c in cases if c in seen)}. Probability: of the unchanged run's answer.",
+        "note": f"Probability: of the unchanged run's answer. Cases: {', '.join(c for c in cases if c in seen)}.",
         "columns": ["number", "value", "changed to", "cases", "verdicts that change", "effects that change",
-                    f"probabilities that move by more than {MOVED}", "largest move", "windows, ratio", "which"],
+                    f"probabilities that move by more than {MOVED}", "largest move", "simulated windows", "which"],
         "table": rows,
     }  # fmt: skip
 
