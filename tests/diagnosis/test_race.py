@@ -93,7 +93,7 @@ def test_a_killed_search_goes_on_and_comes_to_the_same(setup, counted_whole, tmp
 def test_without_time_the_first_answer_says_what_was_not_tried(setup, monkeypatch):
     """The clock strikes whenever it is read: the first effect is fitted, the others have no time."""
     clock = itertools.count()
-    monkeypatch.setattr(successive_halving, "BATCH", 1)
+    monkeypatch.setattr(successive_halving, "EFFORT", dataclasses.replace(successive_halving.EFFORT, sets=(1,)))
     short = searched(setup, seconds=36.0, now=lambda: float(next(clock)))
     assert short.answer.label == SPRING and len(short.state.cut_short) == 2
     assert not_fitted(short.state) == {phrases.NO_TIME_LEFT: sorted(short.state.cut_short, key=labels(setup).index)}

@@ -24,12 +24,9 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from bayessim_mjx.diagnosis.selection.numbers import PRIORS
 
 Array = NDArray[np.float64]
-# Of the period between rows: as exactly as rows and commands lie in time (.07 of a time step of half a period, by which
-# delays differ between simulators: single effects in MuJoCo C at a tenth of the step).
-TIMING = 0.03
-FREE = 100.0  # standard deviations, as good as no bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +65,9 @@ def found(fitter: Fitter, D: Array, B: Array) -> Doubts:
     every = np.stack([late_q, late_v, *servos], 2)
     known = np.concatenate([np.zeros((len(as_known), 2)), as_known], 1)
     kept = (np.abs(every).max((0, 1)) > 0) | np.any(known != 0, 0)
-    return Doubts(TIMING * float(windows.dt) * every[:, :, kept], TIMING * float(windows.dt) * known[:, kept])
+    return Doubts(
+        PRIORS.times * float(windows.dt) * every[:, :, kept], PRIORS.times * float(windows.dt) * known[:, kept]
+    )
 
 
 def _servos(fitter: Fitter, D: Array) -> tuple[list[Array], Array]:
@@ -126,7 +125,7 @@ def _rates(fitter: Fitter, rows: NDArray[np.int64]) -> tuple[Array, Array]:
 def doubted(fit: Fit, doubts: Doubts) -> Fit:
     """The fit with these numbers behind its own, in units of their priors."""
     own = doubts.of(fit)
-    more = tuple(Coordinate(f"doubt{i}", (), 0.0, -FREE, FREE, 1.0, "", stated=True) for i in range(own.shape[2]))
+    more = tuple(Coordinate(f"doubt{i}", (), 0.0, -np.inf, np.inf, 1.0, "", stated=True) for i in range(own.shape[2]))
     values = np.concatenate([fit.values, np.zeros(len(more))])
     return replace(fit, coordinates=(*fit.coordinates, *more), values=values, A=np.concatenate([fit.A, own], 2))
 

@@ -20,35 +20,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
+from bayessim_mjx.diagnosis.selection.numbers import PRIORS
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Priors:
-    """What is believed of the force and the noise before any data are seen.
-
-    Attributes:
-        least: amplitude, as a share of the robot's force scale, below which no simulator is right: two integrators of
-            the same robot differ by as much.
-        usual, spread: median of the amplitude (share of the force scale) and standard deviation of its logarithm: 95 %
-            between .0001 and 1.
-        memories: node spacings over which the force stays alike: from white to the length of a window.
-        noise: standard deviation of the logarithm of the sensors' noise about its estimate from the logs.
-    """
-
-    least: float = 3e-4
-    usual: float = 0.01
-    spread: float = 2.3
-    memories: tuple[float, ...] = (1.0, 4.0, 16.0)
-    noise: float = 0.2
-
-
-PRIORS = Priors()
-STEPS = 25  # of the search for the best hyperparameters
-FLAT = 1e-6  # share of the log density by which a step gains at least: a tenth of a nat of most logs
-OPEN = 0.2  # of the force's nodes, that windows tell of
-FIRST = 3e-3  # amplitude that it begins at, share of the force scale
 
 
 @dataclass(frozen=True)
@@ -79,6 +53,11 @@ class Windows:
     @property
     def forces(self) -> int:
         return self.joints * self.nodes
+
+    @property
+    def memories(self) -> list[float]:
+        """Of the force that are tried, in node spacings: powers of 4, from white to the length of a window."""
+        return [4.0**n for n in range((1 + self.nodes.bit_length()) // 2)]
 
     def some(self, rows: NDArray[np.bool_]) -> Windows:
         """Some of the windows."""
@@ -197,10 +176,10 @@ def learn(windows: Windows, belief: Belief, like: Sequence[Hyper] = ()) -> Learn
     memories are tried.
     """
     nv, channels = windows.joints, len(windows.gram)
-    starts = [np.concatenate([np.full(nv, np.log(FIRST)), np.zeros(channels)])]
-    memories: Sequence[float] = PRIORS.memories
+    starts = [np.concatenate([np.full(nv, np.log(PRIORS.usual)), np.zeros(channels)])]
+    memories = windows.memories
     if like:
-        starts, memories = [np.log(np.concatenate([h.amplitude, h.noise])) for h in like], (like[0].memory,)
+        starts, memories = [np.log(np.concatenate([h.amplitude, h.noise])) for h in like], [like[0].memory]
     start = min(starts, key=lambda x: _slope(x, windows, belief, memories[0])[0]) if len(starts) > 1 else starts[0]
     ends: Array = np.array([(np.log(PRIORS.least), np.log(10.0))] * nv + [(-2.0, 7.0)] * channels)
     unit = _precision(windows) ** -0.5
@@ -208,7 +187,7 @@ def learn(windows: Windows, belief: Belief, like: Sequence[Hyper] = ()) -> Learn
     for memory in memories:
         found = minimize(
             _scaled, start / unit, (unit, windows, belief, memory), "L-BFGS-B", jac=True, bounds=ends / unit[:, None],
-            options={"maxiter": STEPS, "ftol": FLAT},
+            options={"ftol": np.finfo(np.float32).eps},  # products of residuals in single precision are no better
         )  # fmt: skip
         start = found.x * unit
         if best is None or found.fun < best[0]:
@@ -221,7 +200,7 @@ def learn(windows: Windows, belief: Belief, like: Sequence[Hyper] = ()) -> Learn
 def _precision(windows: Windows) -> Array:
     """About what windows and priors tell of each logarithm (Fisher's information), so that steps are alike in all."""
     channels, count = windows.gram.shape[:2]
-    force = 2 * OPEN * windows.nodes * count + PRIORS.spread**-2
+    force = 2 * windows.nodes * count + PRIORS.spread**-2
     noise = 2 * windows.rows * count + PRIORS.noise**-2
     return np.concatenate([np.full(windows.joints, force), np.full(channels, noise)])
 

@@ -25,9 +25,7 @@ from bayessim_mjx.parameters import geometry
 from bayessim_mjx.physics import Physics
 
 Array = NDArray[np.float64]
-APART = 1e-3  # of a range: finite differences, of inertias in single precision
-# standard deviations of the priors as a share of a body's inertia: they decide what its inertia leaves open
-OPEN = 1e-2
+SINGLE = float(np.finfo(np.float32).eps) ** 0.5  # of inertias in single precision: best step of a difference, of 1
 
 
 def compatible(a: Candidate, b: Candidate) -> bool:
@@ -141,14 +139,14 @@ def with_same_inertia(fitter: Fitter, model: Model, effect: Candidate, law: Cand
     moving = [i for i in range(base) if _moves(fitter, i, rest)]
     free = [fitter.base[i] for i in moving] + list(law.coordinates)
     low, high, neutral = (np.array([getattr(c, end) for c in free]) for end in ("low", "high", "neutral"))
-    sure = OPEN * np.sqrt([c.precision for c in free])
+    sure = SINGLE * np.sqrt([c.precision for c in free])
 
     def off(x: Array) -> Array:
         theta = fitter.vector([*others, *free], np.concatenate([fit.values[kept], x]))
         return np.concatenate([((_inertia(physics, theta) - wanted) / scale).ravel(), sure * (x - neutral)])
 
     begun = np.concatenate([fit.values[moving], law.probes[len(law.probes) // 2]])
-    found = least_squares(off, np.clip(begun, low, high), bounds=(low, high), x_scale=high - low, diff_step=APART)
+    found = least_squares(off, np.clip(begun, low, high), bounds=(low, high), x_scale=high - low, diff_step=SINGLE)
     known = fit.values[:base].copy()
     known[moving] = found.x[: len(moving)]
     return Start(known, found.x[len(moving) :])

@@ -19,40 +19,16 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.data_sheet import SURE
 from bayessim_mjx.diagnosis.evidence.laws import compatible
 from bayessim_mjx.diagnosis.evidence.promises import Column
-from bayessim_mjx.diagnosis.evidence.sets import ODDS
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.screen import Projection, judged, projected, simulated
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, HIDDEN, ODDS
+from bayessim_mjx.diagnosis.selection.screen import Projection, judged, looked_at, part, projected, simulated
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
-from bayessim_mjx.diagnosis.selection.window_subset import looked_at, part
 
 Array = NDArray[np.float64]
 AMOUNTS = np.linspace(0.0, 1.0, 101)[1:]  # of an effect, shares of the largest in its range
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Shares of what an effect does, squared and in noises, that refitting other parameters hides.
-
-    Rules of thumb: how often a hidden effect is reported has not been counted.
-
-    Attributes:
-        hidden: at every starting point beside the answer, or more.
-        shown: at one starting point beside the known parameters alone, or less.
-        perhaps: by what was simulated on the known parameters: from here on it is simulated on the answer.
-        most: candidates that are simulated; points: starting points of each, those that show most.
-    """
-
-    hidden: float = 0.98
-    shown: float = 0.9
-    perhaps: float = 0.8
-    most: int = 16
-    points: int = 4
-
-
-LIMITS = Limits()
 
 
 def by_effects(state: SearchState, answer: Model, say: Progress = lambda text, done, total: None) -> tuple[str, ...]:
@@ -62,13 +38,14 @@ def by_effects(state: SearchState, answer: Model, say: Progress = lambda text, d
     others = [c for c in state.candidates if c.label in state.secants.columns]
     others = [c for c in others if all(compatible(c, e) for e in answer.effects)]
     alone, likely = _shown(state, state.base, others), _shown(state, answer, others)
-    some = [c for c in others if alone[c.label][0][0] < LIMITS.shown and likely[c.label][0][0] > LIMITS.perhaps]
-    some = sorted(some, key=lambda c: -likely[c.label][0][0])[: LIMITS.most]
-    plans = [(i, point) for i, c in enumerate(some) for _, point in likely[c.label][: LIMITS.points]]
+    shown = 1.0 - (1.0 - HIDDEN) ** 0.5  # halfway, on a log scale, between what is hidden and what shows wholly
+    some = [c for c in others if alone[c.label][0][0] < shown < likely[c.label][0][0]]
+    some = sorted(some, key=lambda c: -likely[c.label][0][0])[: EFFORT.candidates]
+    plans = [(i, point) for i, c in enumerate(some) for _, point in likely[c.label][: EFFORT.points]]
     own = looked_at(answer.fit, state.settings.screened)
     columns = simulated(state.fitter, answer.fit, some, plans, own, lambda _, done, all_: say("hidden", done, all_))
     found = judged(state.fitter, answer.fit, some, columns, own)
-    return tuple(some[i].label for i, each in found.items() if min(s.absorbed for s, _ in each) > LIMITS.hidden)
+    return tuple(some[i].label for i, each in found.items() if min(s.absorbed for s, _ in each) > HIDDEN)
 
 
 def _shown(state: SearchState, model: Model, candidates: Sequence[Candidate]) -> dict[str, list[tuple[float, Array]]]:
@@ -107,7 +84,7 @@ def by_parameters(state: SearchState, answer: Model) -> dict[str, tuple[str, ...
 def stand_ins(state: SearchState, answer: Model) -> list[StandIn]:
     """Effects that known parameters may stand for.
 
-    An effect stands beside a parameter's deviation where known parameters do all its work (`LIMITS.hidden`), and
+    An effect stands beside a parameter's deviation where known parameters do all its work (`HIDDEN`), and
     where the data sheet speaks for it: without the effect's part the parameters are so much likelier that the odds
     against the effect, one of all candidates and in its best size, are below `ODDS.strong`, and by `ODDS.mention` at
     least. Beside the best one stand those that the data sheet does not speak strongly against; then what it leaves is
@@ -163,7 +140,7 @@ def _works(state: SearchState, answer: Model, fit: Fit) -> dict[str, list[_Work]
         found = []
         for point, change in known[c.label]:
             column = Column(c, point, change)
-            steps = project.taken(change, LIMITS.hidden) if project and column.way.any() else None
+            steps = project.taken(change, HIDDEN) if project and column.way.any() else None
             found += [] if steps is None else [_Work(column, steps)]
         out |= {c.label: found} if found else {}
     return out

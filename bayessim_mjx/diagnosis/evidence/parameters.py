@@ -17,23 +17,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, logsumexp, ndtr
+from scipy.special import hyperu, log_ndtr, logsumexp, ndtr
 
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY, SURE
 from bayessim_mjx.diagnosis.evidence.gaussian import Belief, Learnt
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
+from bayessim_mjx.diagnosis.selection.numbers import PRIORS
 from bayessim_mjx.diagnosis.statistics import Z90, mixture_quantiles
 
 Array = NDArray[np.float64]
 # Shares of the nominal value that are summed over: from a seventh of the prior's accuracy to 100 %; 13 of them change
 # quantiles by less than 1 % of the interval against 49.
 LEVELS = np.geomspace(0.01, 1.0, 13)
-ENDS = (0.05, 0.5, 0.95)
-# of an effect's range: decades that are as likely (`_sized`). Of 120 logs of noise one useless number gains two nats in
-# one, four numbers in none; no alarm in 12 cases with nothing hidden (23a3163)
-SIZES = (1.0, 0.1, 0.01)
-FAR = 30.0  # from where on two terms of an asymptotic series hold a second moment to 1e-4 (`_depth`)
+ENDS = tuple(map(float, ndtr([-Z90, 0.0, Z90])))  # of a 90 % interval, and its middle
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,17 +212,17 @@ class _Numbers:
 def _sized(
     fit: Fit, found: Posterior, free: NDArray[np.bool_], layers: dict[int, float], own: Mapping[int, bool]
 ) -> float:
-    """What the evidence gains where an effect may be small: its range, a tenth and a hundredth of it as likely.
+    """What the evidence gains where an effect may be small: its range and parts of it are as likely (`Priors.sizes`).
 
-    Nobody knows the size of what is missing: a prior as wide as the range alone would hold a small payload for less
-    likely than a small error of a data sheet that does the same (Jeffreys, Theory of Probability, 1961, sec. 3.1).
+    A prior as wide as the range alone would hold a small payload for less likely than a small error of a data sheet
+    that does the same.
     """
     neutral = np.array([c.neutral for c in fit.coordinates])
     precision, inside = (np.array([of(c) for c in fit.coordinates]) for of in (lambda c: c.precision, _truncated))
     numbers = _Numbers(found.middle, found.moments(), np.flatnonzero(free), precision, inside)
     some = [i for i, shape in own.items() if free[i] and not shape and not fit.coordinates[i].stated]
     terms = []
-    for scale in SIZES if some else SIZES[:1]:
+    for scale in PRIORS.sizes if some else PRIORS.sizes[:1]:
         there, ratio = numbers.smaller(some, neutral, fit, scale)
         several = len(own) > 1 and not all(own.values())
         terms.append(ratio + (_without(fit, there, free, layers, own) if several else 0.0))
@@ -270,13 +267,13 @@ def _layer(belief: Belief, i: int, p: float, slope: float, curvature: float) -> 
 
 
 def _depth(slope: float, curvature: float) -> float:
-    """Root mean square distance from a bound under the density exp(-|slope| t - curvature t^2 / 2), t >= 0."""
+    """Root mean square distance from a bound under the density exp(-|slope| t - curvature t^2 / 2), t >= 0.
+
+    Moments of that density are Tricomi functions (Abramowitz and Stegun, 1964, eq. 13.2.5).
+    """
     bend = np.sqrt(curvature)
-    x = abs(slope) / bend
-    mills = np.exp(-0.5 * x**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(-x))  # of a normal density: phi(x) / Phi(-x)
-    # its tail in 1/x where the difference below would lose its digits
-    square = 2 / x**2 - 10 / x**4 if x > FAR else 1 + x**2 - x * mills
-    return float(np.sqrt(square) / bend)
+    half = 0.5 * (slope / bend) ** 2
+    return float(np.sqrt(hyperu(1.5, 0.5, half) / hyperu(0.5, 0.5, half)) / bend)
 
 
 def _truncated(c: Coordinate, scale: float = 1.0) -> float:

@@ -3,7 +3,7 @@
 A candidate's column is a secant: the change of the residual from neutral to a starting point. With force and start
 states integrated out (`gaussian`), the evidence of every set is algebra on one matrix of inner products, so all singles
 and pairs are looked at, and larger sets grow from the best. The force's amplitude is not known before a set is fitted:
-the best of a few shares of the amplitude without it counts.
+the best of the amplitude without it and parts of it (`Priors.sizes`) counts.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.evidence.gaussian import PRIORS, Belief, Hyper, correlation
+from bayessim_mjx.diagnosis.evidence.gaussian import Belief, Hyper, correlation
 from bayessim_mjx.diagnosis.evidence.laws import beside
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
@@ -22,11 +22,10 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Key
-from bayessim_mjx.diagnosis.selection.screen import room, simulated
-from bayessim_mjx.diagnosis.selection.window_subset import looked_at
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, PRIORS
+from bayessim_mjx.diagnosis.selection.screen import looked_at, room, simulated
 
 Array = NDArray[np.float64]
-SHARES = (1.0, 0.3, 0.1, 0.03)  # of the amplitude on the fit itself, that a set may leave
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +93,7 @@ class Promises:
 
     def __init__(self, part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column]) -> None:
         self.columns = list(columns)
-        self.levels = [_level(part, belief, _scaled(hyper, f), self.columns) for f in SHARES]
+        self.levels = [_level(part, belief, _scaled(hyper, f), self.columns) for f in PRIORS.sizes]
         self.base = max(level.base for level in self.levels)
 
     def pairs(self, blocked: NDArray[np.bool_], count: int) -> list[Promise]:
@@ -155,11 +154,9 @@ class _Level:
         return np.where(determinant > 1e-6 * np.outer(d, d), found, -np.inf)
 
 
-def leading(
-    part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column], points: int, most: int
-) -> list[Column]:
-    """The columns that promise most by themselves, so many of each candidate and in all; few inner products tell."""
-    g, s = _Rest(part, belief, _scaled(hyper, SHARES[-2]), columns, diagonal=True).projected()
+def leading(part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column]) -> list[Column]:
+    """The columns that promise most by themselves, so many of each candidate (`Effort.points`); few products tell."""
+    g, s = _Rest(part, belief, _scaled(hyper, PRIORS.sizes[1]), columns, diagonal=True).projected()
     precision = np.maximum([c.precision for c in columns], 1e-12)
     t = np.clip(g / (s + precision), *np.array([c.room for c in columns]).T)
     nats = g * t - 0.5 * t**2 * (s + precision) + 0.5 * np.log(precision / (s + precision))
@@ -168,8 +165,8 @@ def leading(
     for j in np.argsort(-nats):
         label = columns[j].candidate.label
         count[label] = count.get(label, 0) + 1
-        out += [columns[j]] if count[label] <= points else []
-    return out[:most]
+        out += [columns[j]] if count[label] <= EFFORT.points else []
+    return out
 
 
 class _Rest:
@@ -233,28 +230,6 @@ def _level(part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column]) 
 
 
 @dataclass(frozen=True)
-class Breadth:
-    """How far one look goes; more of each finds the same sets, later.
-
-    Attributes:
-        pairs: of columns that promise most; seeds: sets that larger ones grow from.
-        most: effects in a set; more: effects that one look adds (each is then left out in turn).
-        points: of a candidate that are looked at in sets; anew: candidates that are simulated on a model with effects.
-    """
-
-    pairs: int = 24
-    seeds: int = 4
-    most: int = 8
-    more: int = 3
-    points: int = 3
-    anew: int = 16
-    columns: int = 120
-
-
-BREADTH = Breadth()
-
-
-@dataclass(frozen=True)
 class Plan:
     """A set that promises something, and how to begin its fit.
 
@@ -289,9 +264,9 @@ def around(weighing: Weighing, key: Key, say: Progress) -> list[Plan]:
     if not columns:
         return []
     (part, belief), hyper = _part(weighing, fit, state.secants.own), weighing.scored[key].learnt.hyper
-    columns = leading(part, belief, hyper, columns, BREADTH.points, BREADTH.columns)
+    columns = leading(part, belief, hyper, columns)
     if key:
-        labels = list(dict.fromkeys(c.candidate.label for c in columns))[: BREADTH.anew]
+        labels = list(dict.fromkeys(c.candidate.label for c in columns))[: EFFORT.candidates]
         some = [c for c in others if c.label in labels]
         plans = [(some.index(c.candidate), c.point) for c in columns if c.candidate.label in labels]
         own = looked_at(fit, state.settings.screened)
@@ -316,7 +291,7 @@ def _plans(weighing: Weighing, key: Key, promises: Promises) -> list[Plan]:
     ranked = sorted(zip(gains, columns, strict=True), key=lambda pair: pair[0])
     whole = {c.candidate.label: c.point for _, c in ranked}
     out, total = [], weighing.total(key)
-    for p in _sets(promises, price, min(BREADTH.most - len(key), BREADTH.more)):
+    for p in _sets(promises, price):
         some = [columns[j] for j in p.own]
         own = key | {c.candidate.label for c in some}
         points = (some[0].point, whole[some[0].candidate.label]) if len(some) == 1 else ()
@@ -325,16 +300,15 @@ def _plans(weighing: Weighing, key: Key, promises: Promises) -> list[Plan]:
     return sorted(out, key=lambda p: -p.nats)
 
 
-def _sets(promises: Promises, price: float, most: int) -> list[Promise]:
+def _sets(promises: Promises, price: float) -> list[Promise]:
     """Single columns, pairs, and larger sets that grow from the best of these as long as each more pays its price."""
     columns, usable = promises.columns, range(len(promises.columns))
     blocked = np.array([[not beside(a.candidate, b.candidate) for b in columns] for a in columns])
     found = {p.own: p for p in promises.of([(j,) for j in usable])}
-    if most > 1:
-        found |= {p.own: p for p in promises.pairs(blocked, BREADTH.pairs)}
-    for seed in sorted(found.values(), key=lambda p: price * len(p.own) - p.nats)[: BREADTH.seeds]:
+    found |= {p.own: p for p in promises.pairs(blocked, 2 * EFFORT.batch)}
+    for seed in sorted(found.values(), key=lambda p: price * len(p.own) - p.nats)[: EFFORT.sets[1]]:
         grown = seed
-        while len(grown.own) < most:
+        while len(grown.own) < len(EFFORT.sets):
             more = [tuple(sorted((*grown.own, j))) for j in usable if not blocked[j, list(grown.own)].any()]
             top = max(promises.of(more), key=lambda p: p.nats, default=None)
             if top is None or top.nats < grown.nats + price:

@@ -8,7 +8,7 @@ likely.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from bayessim_mjx.diagnosis.evidence.laws import (
 )
 from bayessim_mjx.diagnosis.evidence.masked_effects import stand_ins
 from bayessim_mjx.diagnosis.evidence.promises import Column, Plan, around
-from bayessim_mjx.diagnosis.evidence.sets import ODDS, Weighed
+from bayessim_mjx.diagnosis.evidence.sets import Weighed
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
@@ -31,36 +31,11 @@ from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER, Progress
 from bayessim_mjx.diagnosis.selection.fits import cut_back, polish
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.selection.successive_halving import Entries, fit_entries
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How many sets are fitted. Larger numbers find the same sets, but take longer.
-
-    Attributes:
-        rounds: at most so many, each around the leading set.
-        sizes: sets with one, two and more further effects that a round fits on top of the leading set.
-        instead: likewise in the place of each of its effects; base: on the known parameters.
-        least: single effects that are fitted in any case, as promises are linear.
-        margin: nats below the leading set, within which a promised set is fitted.
-        leading: sets whose ranges may grow; finalists: sets whose fits are brought to convergence.
-    """
-
-    rounds: int = 5
-    sizes: tuple[int, ...] = (6, 4, 2)
-    instead: tuple[int, ...] = (6, 0, 0)
-    base: tuple[int, ...] = (2, 4, 2)
-    least: int = 4
-    margin: float = 30.0
-    leading: int = 3
-    finalists: int = 6
-
-
-EFFORT = Effort()
 
 
 class Search:
@@ -75,7 +50,7 @@ class Search:
 
     def run(self) -> Weighed:
         """Run all rounds; returns the posterior over the fitted sets."""
-        self._fit(self._worth(self._around(BASE), (EFFORT.sizes[0], 0, 0), EFFORT.least), SINGLES, SINGLES)
+        self._fit(self._worth(self._around(BASE), EFFORT.sets[:1], EFFORT.sets[1]), SINGLES, SINGLES)
         self._leading()
         for made in range(EFFORT.rounds):
             best = self._order()[0]
@@ -103,10 +78,10 @@ class Search:
     def _todo(self, best: Key) -> list[Plan]:
         """Plans around the leading set; if it leaves nothing relevant, larger sets have to promise more than it has."""
         smaller = [k for k in (best - {x} for x in sorted(best)) if k and k in self.weighing.scored]
-        plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.instead)]
+        plans = [p for k in smaller for p in self._worth(self._around(k), EFFORT.sets[:1])]
         plans += [p for k in dict.fromkeys([best, *self.weighing.weighed().beside]) for p in self._related(k)]
-        more = self._worth(self._around(best), EFFORT.sizes)
-        more += self._worth(self._around(BASE), EFFORT.base) if best else []
+        more = self._worth(self._around(best), EFFORT.sets)
+        more += self._worth(self._around(BASE), EFFORT.sets) if best else []
         if self.weighing.settled(best):
             likelier = self.weighing.total(best) + np.log(ODDS.mention)
             more = [p for p in more if p.nats > likelier]
@@ -151,9 +126,9 @@ class Search:
         return key not in self.state.models and key not in self.state.vain
 
     def _around(self, key: Key) -> list[Plan]:
-        """Plans around a set, anew where its fit has gained a nat since: their evidence is counted from that fit."""
+        """Plans around a set, anew where its fit has gained since: their evidence is counted from that fit."""
         total = self.weighing.total(key)
-        if key not in self._plans or abs(self._plans[key][0] - total) > 1.0:
+        if key not in self._plans or abs(self._plans[key][0] - total) > np.log(ODDS.mention):
             self._plans[key] = total, around(self.weighing, key, self.say)
         return self._plans[key][1]
 
@@ -163,9 +138,10 @@ class Search:
         out: dict[Key, Plan] = {}
         count = [0] * len(sizes)
         for plan in sorted(plans, key=lambda p: -p.nats):
-            size = min(len(plan.columns), len(sizes)) - 1
-            promising = plan.nats > top - EFFORT.margin or count[size] < least
-            if promising and self._new(plan.key) and plan.key not in out and count[size] < sizes[size]:
+            size = len(plan.columns) - 1
+            if size >= len(sizes) or not self._new(plan.key) or plan.key in out:
+                continue
+            if count[size] < (sizes[size] if plan.nats > top - EFFORT.margin else least):
                 out[plan.key] = plan
                 count[size] += 1
         return list(out.values())
@@ -176,7 +152,7 @@ class Search:
         Near the leading set too: a law that is not quite right has others beside it, which the right one needs no more.
         """
         while True:
-            some = [k for k in self._order()[: EFFORT.leading] if k]
+            some = [k for k in self._order()[: len(EFFORT.sets)] if k]
             for key in some:
                 widened(self.state, self.state.models[key], self.say)
             self.weighing.score(some)
@@ -189,7 +165,7 @@ class Search:
 
     def _finish(self) -> None:
         """The fits of the finalists brought to their end."""
-        some = [k for k in self._order()[: EFFORT.finalists] if k and k not in self._polished]
+        some = [k for k in self._order()[: EFFORT.sets[0]] if k and k not in self._polished]
         if some and not self.state.settings.budget.over(LEAVING_OUT):
             polish(self.state, [self.state.models[k] for k in some], self.say)
             self._polished |= set(some)
@@ -198,13 +174,13 @@ class Search:
     def _possible(self) -> None:
         """The answer with one effect more that may do the work of a known parameter.
 
-        The logs do not need it, so it changes no name. It widens the interval of the parameter.
+        The logs do not need it, so it changes no name. It widens the interval of the parameter. A fit of before began
+        at the parameter as it is, and may rest there.
         """
         key = self.weighing.weighed().answer
-        some = [s for s in stand_ins(self.state, self.state.models[key]) if self._new(key | {s.candidate.label})]
         plans = [
             Plan(key | {s.candidate.label}, np.inf, key, (s.column,), (1.0,), (s.point,), key, (s.known,))
-            for s in sorted(some, key=lambda s: -s.nats)[: EFFORT.instead[0]]
+            for s in sorted(stand_ins(self.state, self.state.models[key]), key=lambda s: -s.nats)[: EFFORT.sets[0]]
         ]
         if plans and not self.state.settings.budget.over(TOGETHER):
             self._fit(plans, "beside known parameters", TOGETHER)

@@ -14,6 +14,7 @@ from bayessim_mjx.diagnosis import phrases
 from bayessim_mjx.diagnosis.evidence import force_left, masked_effects
 from bayessim_mjx.diagnosis.evidence.force_left import ForceLeft
 from bayessim_mjx.diagnosis.evidence.laws import compatible, special_cases
+from bayessim_mjx.diagnosis.evidence.promises import Column
 from bayessim_mjx.diagnosis.evidence.search import Search
 from bayessim_mjx.diagnosis.evidence.sets import Weighed
 from bayessim_mjx.diagnosis.evidence.weighing import Estimated, Size, Weighing, at_its_mean, estimated, size_in
@@ -29,8 +30,6 @@ from bayessim_mjx.diagnosis.selection.successive_halving import Entries, fit_ent
 from bayessim_mjx.diagnosis.statistics import shapley
 
 Array = NDArray[np.float64]
-MANY = 4  # effects; of an answer with more not every subset is fitted
-FURTHEST = 2.0  # times the screened start; a secant is not trusted further
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +62,7 @@ class Selection:
         state: all fitted models; it is only read from here on.
         answer: the named model (`state.base` if no effect is named).
         rivals: {label of one of its effects: explanations that may take its place}.
-        subsets: {labels: the model with these of its effects}, every one refitted; {} of one effect or of too many.
+        subsets: {labels: the model with these of its effects}, every one refitted; {} of one effect or without time.
         promised: predicted share of the base model's gap that its effects close, {label: part}.
         chosen: {operating condition: effects that are named without it}.
         elsewhere: share of the gap closed on conditions that the choice was made without; NaN of one condition.
@@ -113,12 +112,12 @@ def select(
     names = np.unique(fitter.simulator.windows.group)
     chosen = {int(g): search.weighing.without(int(g)).answer for g in names} if len(names) > 1 and found.answer else {}
     answer = state.models[found.answer]
-    few = 1 < len(answer.effects) <= MANY and not settings.budget.over(LEAVING_OUT)
+    several = len(answer.effects) > 1 and not settings.budget.over(LEAVING_OUT)
     return Selection(
         state=state,
         answer=answer,
         rivals={e.label: tuple(_rivals(search.weighing, e, found)) for e in answer.effects},
-        subsets=_subsets(state, answer, say) if few else {},
+        subsets=_subsets(state, answer, say) if several else {},
         promised=promised(state, answer.effects) if answer.effects else (0.0, {}),
         chosen=chosen,
         elsewhere=_elsewhere(state, chosen),
@@ -221,21 +220,8 @@ def _linear(state: SearchState, effects: Sequence[Candidate]) -> tuple[Quadratic
     pairs = list(zip(effects, starts, strict=True))
     thetas = [fitter.vector((*fit.coordinates, *e.coordinates), np.concatenate([fit.values, s])) for e, s in pairs]
     moved = fitter.whiten(fitter.simulator.run(np.stack(thetas), np.repeat(fit.offsets[None], len(thetas), 0)))
-    A = np.concatenate([fit.A, np.moveaxis(fit.r[None] - moved, 0, -1)], axis=2)
+    columns = [Column(*pair, fit.r - own) for pair, own in zip(pairs, moved, strict=True)]
+    A = np.concatenate([fit.A, *(c.change[..., None] for c in columns)], axis=2)
     q, _ = eliminate(fit.r, A, fit.B, fit.offsets, fitter.spread)
-    known = fit.belief()
-    return q, np.array([*known, *(_precision(e, s) for e, s in pairs)]), np.array([_furthest(e, s) for e, s in pairs])
-
-
-def _precision(effect: Candidate, start: Array) -> float:
-    return float(sum(c.precision * (s - c.neutral) ** 2 for c, s in zip(effect.coordinates, start, strict=True)))
-
-
-def _furthest(effect: Candidate, start: Array) -> float:
-    """The amount at which a coordinate reaches its bound."""
-    ends = [FURTHEST]
-    for c, s, shape in zip(effect.coordinates, start, effect.shapes, strict=True):
-        way = s - c.neutral
-        if way and not shape:
-            ends.append(((c.high if way > 0 else c.low) - c.neutral) / way)
-    return max(min(ends), 0.0)
+    precision, most = [c.precision for c in columns], [c.room[1] for c in columns]
+    return q, np.array([*fit.belief(), *precision]), np.array(most)

@@ -10,39 +10,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from bayessim_mjx.diagnosis.selection.models import BASE, Key
+from bayessim_mjx.diagnosis.selection.numbers import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.selection.search_state import log_prior
-
-
-@dataclass(frozen=True)
-class Relevance:
-    """How much an effect has to change to be relevant, however significant (docs/decisions/relevance_and_odds.md).
-
-    Attributes:
-        share: of the squared gap that the known parameters leave; laws of two simulators differ by as much.
-        noise: noise variances, which are added; less does not show in the motion.
-    """
-
-    share: float = 0.003
-    noise: float = 0.1
-
-
-RELEVANCE = Relevance()
-
-
-@dataclass(frozen=True)
-class Odds:
-    """Odds between two explanations (Kass and Raftery, J. Am. Stat. Assoc. 90, 1995, sec. 3.2).
-
-    Attributes:
-        mention: below it the difference is not worth more than a bare mention: the simpler one is named.
-        strong: below it the evidence is not "strong": both stand.
-    """
-
-    mention: float = 3.0
-    strong: float = 20.0
-
-
-ODDS = Odds()
 
 
 @dataclass(frozen=True)

@@ -10,21 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.evidence import doubts
-from bayessim_mjx.diagnosis.evidence.gaussian import PRIORS, Hyper, Learnt, learn, marginal, windows_of
+from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, marginal, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import Integrated, Posterior, belief_of, integrated
-from bayessim_mjx.diagnosis.evidence.sets import RELEVANCE, Weighed, weighed
+from bayessim_mjx.diagnosis.evidence.sets import Weighed, weighed
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.residual import disturbance
 from bayessim_mjx.diagnosis.selection import heldout
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, PRIORS, RELEVANCE
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.statistics import Z90, mixture_quantiles
 
 Array = NDArray[np.float64]
-MOVES = 3  # moves of a model towards its posterior mean, at most
-MOVED = 0.1  # standard deviations; smaller moves are not simulated
-WORSE = 1.0  # nats that the model may lose by moves that do not converge
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,17 +176,18 @@ def at_its_mean(weighing: Weighing, key: Key) -> Model:
     """
     fitter, state, old = weighing.state.fitter, weighing.state, weighing.scored[key]
     low, high = (np.array([getattr(c, end) for c in old.model.fit.coordinates]) for end in ("low", "high"))
-    for _ in range(MOVES):
+    for _ in range(EFFORT.rounds):
         here = weighing.scored[key]
         mean, covariance = _own(here)
-        mean, sd = np.clip(mean, low, high), np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        if np.all(np.abs(mean - here.model.fit.values) <= MOVED * sd):
+        mean = np.clip(mean, low, high)
+        # a move by d standard deviations is worth d^2 / 2 nats
+        if np.all((mean - here.model.fit.values) ** 2 <= 2 * EFFORT.tolerance * np.diag(covariance)):
             break
         moved = fitter.refresh(replace(here.model.fit, values=mean, history=()))
         state.models[key] = scored(fitter, moved, old.model.effects)
         weighing.score([key])
     else:
-        if weighing.scored[key].found.nats < old.found.nats - WORSE:
+        if weighing.scored[key].found.nats < old.found.nats - np.log(ODDS.mention):
             state.models[key], weighing.scored[key] = old.model, old
     (model,) = heldout.refitted(fitter, [state.models[key]])
     state.models[key] = model

@@ -13,25 +13,11 @@ from bayessim_mjx.diagnosis.fitting.quadratic import solve
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
 from bayessim_mjx.diagnosis.selection.fits import AFRESH
 from bayessim_mjx.diagnosis.selection.models import Model, nats, scored
+from bayessim_mjx.diagnosis.selection.numbers import ODDS, PRIORS
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.physics import Physics
 
-
-@dataclass(frozen=True)
-class Widening:
-    """How ranges grow, and when an estimate is at the end of one."""
-
-    # rules of thumb, none counted alone; with them 9 of 10 single effects were named, and there was no alarm in 6 cases
-    # (31 fresh cases, d462f0c)
-    near: float = 0.001  # of a range: at its end
-    # a range grows by this factor, up to so many times what it was at first
-    twice: float = 2.0
-    farthest: float = 64.0
-    nats: float = 2.0  # of held-out evidence that a wider range has to bring: odds of 7 to 1
-    steps: int = 8  # of a fit in a wider range
-
-
-WIDENING = Widening()
+SINGLE = float(np.finfo(np.float32).eps)  # values are written into the model in single precision
 Change = Callable[[Physics, Coordinate, float], Coordinate]  # (physics, its range, its value) -> its new range
 
 
@@ -53,15 +39,15 @@ class Bound:
 def widened(state: SearchState, model: Model, say: Progress) -> Model:
     """The model with ranges as wide as it takes for its effects' parameters to lie within, refitted.
 
-    A range doubles as long as a still wider one promises held-out evidence, up to `farthest` times what it was; what
-    has brought it is kept. It stays where its end means that the effect is off, where physics ends, and where it sizes
-    an effect's memory.
+    A range doubles as long as a still wider one promises strong held-out evidence (`Odds.strong`), up to as many times
+    as the smallest usual size is below it (`Priors.sizes`). What has brought it is kept. A range stays where its end
+    means that the effect is off, where physics ends, and where it sizes an effect's memory.
     """
     last = model
     while not state.settings.budget.over(LEAVING_OUT) and _held(state, last) and _promised(state, last):
         say("wider ranges", 0, 1)
         last = _refitted(state, last, _moved(state, last, _grown))
-        if nats(model, last) >= WIDENING.nats:
+        if nats(model, last) >= math.log(ODDS.strong):
             _adopt(state, last)
             model = last
     return model
@@ -70,7 +56,7 @@ def widened(state: SearchState, model: Model, say: Progress) -> Model:
 def _promised(state: SearchState, model: Model) -> bool:
     """Whether the held-out evidence that ranges as wide as they may get promise is worth a refit."""
     left = max(model.total - promise(state, model), 1e-9)
-    return 0.5 * model.samples * math.log(model.total / left) > WIDENING.nats
+    return 0.5 * model.samples * math.log(model.total / left) > math.log(ODDS.strong)
 
 
 def promise(state: SearchState, model: Model) -> float:
@@ -105,8 +91,8 @@ def of(physics: Physics, coordinate: Coordinate, value: float) -> Bound | None:
 
 
 def _end(c: Coordinate, value: float) -> str:
-    room = WIDENING.near * (c.high - c.low)
-    return "high" if c.high - value < room else "low" if value - c.low < room else ""
+    room = SINGLE * (c.high - c.low)
+    return "high" if c.high - value <= room else "low" if value - c.low <= room else ""
 
 
 def _farthest(physics: Physics, coordinate: Coordinate, end: str) -> float:
@@ -115,13 +101,14 @@ def _farthest(physics: Physics, coordinate: Coordinate, end: str) -> float:
     low, high = min(p.low for p in own), max(p.high for p in own)
     quantity = physics.quantity(coordinate.index[0])
     least, most = quantity.ends()
+    times = 1 / PRIORS.sizes[-1]
     if quantity.remembered:
         return high if end == "high" else low
     if end == "high":
-        return high if high >= most else min(most, coordinate.neutral + WIDENING.farthest * (high - coordinate.neutral))
+        return high if high >= most else min(most, coordinate.neutral + times * (high - coordinate.neutral))
     if low <= least:
         return low
-    return low / WIDENING.farthest if low > 0 else coordinate.neutral + WIDENING.farthest * (low - coordinate.neutral)
+    return low / times if low > 0 else coordinate.neutral + times * (low - coordinate.neutral)
 
 
 def _moved(state: SearchState, model: Model, change: Change) -> list[Candidate]:
@@ -155,9 +142,9 @@ def _grown(physics: Physics, c: Coordinate, value: float) -> Coordinate:
         return c
     far = _farthest(physics, c, end)
     if end == "high":
-        wider = replace(c, high=min(far, c.neutral + WIDENING.twice * (c.high - c.neutral)))
+        wider = replace(c, high=min(far, c.neutral + 2 * (c.high - c.neutral)))
     else:
-        low = c.low / WIDENING.twice if c.low > 0 else c.neutral + WIDENING.twice * (c.low - c.neutral)
+        low = c.low / 2 if c.low > 0 else c.neutral + 2 * (c.low - c.neutral)
         wider = replace(c, low=max(far, low))
     return wider if c.stated else replace(wider, precision=shrink(wider))
 
@@ -167,7 +154,7 @@ def _refitted(state: SearchState, model: Model, effects: Sequence[Candidate]) ->
     own = {c.name: c for e in effects for c in e.coordinates}
     coordinates = tuple(c if i < base else own[c.name] for i, c in enumerate(model.fit.coordinates))
     start = fitter.refresh(replace(model.fit, coordinates=coordinates, **AFRESH))
-    (fit,) = fitter.iterate([start], WIDENING.steps, state.fresh)
+    (fit,) = fitter.iterate([start], state.settings.iterations, state.fresh)
     return scored(fitter, fitter.refresh(fit), tuple(effects))
 
 

@@ -8,17 +8,14 @@ from dataclasses import dataclass, replace
 
 Progress = Callable[[str, int, int], None]  # (what is being done, done, total)
 
-# Shares of the time at which a part of the search ends; the stages after the search have the rest. They are shares of
-# the time that is left once the simulator is compiled: nothing before that is cut. A choice: the effects that a search
-# misses when it is cut were not counted.
 KNOWN = "known parameters"  # on a stiff arm this fit alone took longer than the whole limit
 SCREENING, SINGLES, TOGETHER = "screening", "single effects", "effects together"
 LEAVING_OUT = "leaving out"  # the last part: the answer with each of its effects left out
-ENDS = {
-    KNOWN: 0.1, SCREENING: 0.18, SINGLES: 0.3, TOGETHER: 0.45, LEAVING_OUT: 0.68,
-}  # fmt: skip
-
-ROOM = 0.8  # share of the time after which no optional stage begins: whole logs of a stiff arm took a fifth
+PARTS = (KNOWN, SCREENING, SINGLES, TOGETHER, LEAVING_OUT, "stages", "whole logs")  # whole logs: of a stiff arm a fifth
+# Share of the time at which a part of the search ends: all have as much, the last two after the search. It is the time
+# that is left once the simulator is compiled: nothing before that is cut. Effects that a search misses when it is cut
+# were not counted.
+ENDS = {part: (i + 1) / len(PARTS) for i, part in enumerate(PARTS)}
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,7 @@ class Budget:
     @property
     def late(self) -> bool:
         """Whether it is too late to begin a stage that the verdict does not need: it compiles its own programs."""
-        return self.spent > ROOM * self.seconds
+        return self.spent > ENDS["stages"] * self.seconds
 
     def searching(self) -> Budget:
         """The budget of a search that begins now."""

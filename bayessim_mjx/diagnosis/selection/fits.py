@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,27 +15,13 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection.budget import KNOWN, LEAVING_OUT, SCREENING, Progress
 from bayessim_mjx.diagnosis.selection.models import BASE, Model, scored
-from bayessim_mjx.diagnosis.selection.screen import SIZES, screen
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS
+from bayessim_mjx.diagnosis.selection.screen import screen
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings
 
-
-@dataclass(frozen=True)
-class Rules:
-    """How fits far from the logs are brought to their end."""
-
-    # as long as a round of so many steps gains that many nats: evidence is compared to about one
-    rounds: int = 5
-    steps: int = 4
-    gains: float = 1.0
-    refreshed: float = 0.3  # of the time left, for the first columns of all that are polished
-    # times the best cost that a fit has to be able to reach; a rule of thumb, not counted
-    near: float = 1.3
-
-
-RULES = Rules()
 POLISHING = "polishing"
 # of a fit that goes on with new columns: steps that were refused on old ones would hold it, and its start states, back
-AFRESH: dict[str, Any] = {"history": (), "damping": 1e-3, "reach": np.ones(1)}
+AFRESH: dict[str, Any] = {"history": (), "damping": Fit.damping, "reach": np.ones(1)}
 
 
 def begin(
@@ -60,7 +47,9 @@ def begin(
     began, before = settings.budget.now(), fitter.simulator.rollouts
     fit = nominal
     for _ in range(2):  # the second time from start states' columns of its own
-        (fit,) = fitter.iterate([replace(fit, **AFRESH)], 10, lambda f: range(len(f.coordinates)), keep=in_time)
+        (fit,) = fitter.iterate(
+            [replace(fit, **AFRESH)], EFFORT.steps, lambda f: range(len(f.coordinates)), keep=in_time
+        )
         fit = fitter.refresh(fit)
         if settings.budget.over(KNOWN):
             break
@@ -85,7 +74,7 @@ def _affordable(candidates: Sequence[Candidate], settings: Settings, seconds: fl
         return settings
     points = max(sum(len(c.probes) for c in candidates), 1)
     windows = budget.left(SCREENING) / max(seconds, 1e-9) / points
-    return replace(settings, screened=int(min(max(windows, SIZES.fewest), settings.screened)))
+    return replace(settings, screened=int(min(max(windows, 1.0), settings.screened)))
 
 
 def polish(state: SearchState, models: Sequence[Model], say: Progress = lambda text, done, total: None) -> list[Model]:
@@ -102,7 +91,7 @@ def polish(state: SearchState, models: Sequence[Model], say: Progress = lambda t
 
     fits: list[Fit] = []
     for model in models:
-        if fits and budget.spent - began > RULES.refreshed * left:
+        if fits and budget.spent - began > left / 2:  # the other half is for steps
             break
         fits.append(counted(fitter.refresh(model.fit)))
     if later := models[len(fits) :]:
@@ -115,26 +104,18 @@ def polish(state: SearchState, models: Sequence[Model], say: Progress = lambda t
 
 
 def _to_the_end(state: SearchState, fits: Sequence[Fit], counted: Callable[[Fit], Fit]) -> list[Fit]:
-    """Fits with new columns every few steps, as long as that lowers their cost.
-
-    No fit goes on when the time is over. A fit stops if it could not come near the best one even if each further round
-    gained as much as the last.
-    """
-    fits, running = list(fits), list(range(len(fits)))
-    for made in range(RULES.rounds):
+    """Fits with new columns every few steps, as long as that gains (`Odds.mention`) and there is time."""
+    fits, running, gain = list(fits), list(range(len(fits))), 2 * math.log(ODDS.mention)
+    for _ in range(EFFORT.rounds):
         if state.settings.budget.over(LEAVING_OUT):
             break
         start = [replace(fits[i], **AFRESH) for i in running]
-        tolerance = 2 * RULES.gains / max(fit.cost for fit in start)
-        moved = state.fitter.iterate(start, RULES.steps, lambda f: state.fresh(f) if state.astray(f) else (), tolerance)
+        tolerance = gain / max(fit.cost for fit in start)
+        moved = state.fitter.iterate(start, EFFORT.rounds, lambda f: (), tolerance)
         for i, fit in zip(running, moved, strict=True):
             late = state.settings.budget.over(LEAVING_OUT)
             fits[i] = fit if late else counted(state.fitter.refresh(fit))
-        fell = {i: before.cost - fits[i].cost for i, before in zip(running, start, strict=True)}
-        least, left = min(fit.cost for fit in fits), RULES.rounds - 1 - made
-        running = [
-            i for i in running if fell[i] > 2 * RULES.gains and fits[i].cost - left * fell[i] <= RULES.near * least
-        ]
+        running = [i for i, before in zip(running, start, strict=True) if before.cost - fits[i].cost > gain]
         if not running:
             break
     return fits
@@ -142,18 +123,9 @@ def _to_the_end(state: SearchState, fits: Sequence[Fit], counted: Callable[[Fit]
 
 def _again(state: SearchState, fit: Fit) -> Fit:
     """A fit with contacts, from its own start states and from the measured ones; the better of both."""
-    both = {id(f): f for f in (fit, state.begun(fit))}
-    return min((_on(state.fitter, f) for f in both.values()), key=lambda f: f.cost)
-
-
-def _on(fitter: Fitter, fit: Fit) -> Fit:
-    for _ in range(RULES.rounds):
-        before = fit.cost
-        (fit,) = fitter.iterate([replace(fit, history=())], 2, lambda f: range(len(f.coordinates)))
-        fit = fitter.refresh(fit)
-        if fit.cost > 0.9 * before:
-            break
-    return fit
+    both = {id(f): replace(f, history=()) for f in (fit, state.begun(fit))}
+    found = state.fitter.iterate(list(both.values()), EFFORT.steps, lambda f: range(len(f.values)), EFFORT.tolerance)
+    return min(map(state.fitter.refresh, found), key=lambda f: f.cost)
 
 
 def cut_back(state: SearchState, model: Model, kept: Sequence[Candidate]) -> Fit:

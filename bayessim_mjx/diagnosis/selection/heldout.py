@@ -16,22 +16,12 @@ from bayessim_mjx.diagnosis.fitting.quadratic import RULES as HELD_OUT
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
 from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Rules:
-    """How a fit without a condition goes on from the common one, and how finely intervals are looked for."""
-
-    steps: int = 3  # of a fit without a condition, at most
-    rest: float = 0.005  # nats: what a further step has to promise; not counted
-    within: float = 1.02  # of the common fit's cost: the most that such a fit leaves of the same windows
-    grid: int = 400  # shares looked at
-    finest: float = 0.01  # of the noise: what a share may leave of the gap where it is looked at most finely
-
-
-RULES = Rules()
+GRID = 1000  # shares at which an interval is looked for, dense near 1: 16 decades of float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +72,7 @@ def refitted(fitter: Fitter, models: Sequence[Model]) -> list[Model]:
     alone = [fitter.told_alone(m.fit) for m in models]
     plans = [(i, g) for i in range(len(models)) for g in range(len(names)) if not alone[i][g]]
     folds = [_Fold(fitter, models[i], group != names[g]) for i, g in plans]
-    for _ in range(RULES.steps):
+    for _ in range(EFFORT.rounds):
         if not (running := [fold for fold in folds if not fold.rests]):
             break
         thetas = np.stack([fitter.vector(fold.fit.coordinates, fold.values) for fold in running])
@@ -99,16 +89,17 @@ class _Fold:
     """A fit that goes on from the common one with some of the windows alone.
 
     Gauss-Newton steps on the common fit's columns, not descent: at the scale of these steps costs are rough (contacts,
-    dry friction, single precision), and a descent would stay where it is. A step that leaves the windows much worse
-    off than the common fit is halved. Directions that these windows do not tell stay where the common fit has them.
-    It rests at a step too small to be worth a simulation.
+    dry friction, single precision), and a descent would stay where it is. A step that makes the windows much less
+    likely than the common fit (`Odds.strong`) is halved. Directions that these windows do not tell stay where the
+    common fit has them. It rests at a step too small to be worth a simulation.
     """
 
     def __init__(self, fitter: Fitter, model: Model, kept: NDArray[np.bool_]) -> None:
         fit = model.fit
         self.fitter, self.fit = fitter, replace(fit, weight=fit.weight * kept)
         cost = fitter.cost(self.fit, fit.r, fit.offsets, fit.values)
-        self.limit, self.worth = RULES.within * cost, 2 * RULES.rest * cost / (model.samples * kept.mean())
+        nat = 2 * cost / (model.samples * kept.mean())
+        self.limit, self.worth = cost + nat * math.log(ODDS.strong), nat * EFFORT.tolerance
         self.found = fit.values
         self.values, self.offsets = self._step(fit.values, fit.offsets, fit.r)
 
@@ -240,10 +231,9 @@ class Closed:
         every, value = np.ones((1, len(self.before))), self.value
         if len(rows) < 2 or math.isnan(value):
             return statistics.NOTHING
-        before, _, noise = (float(x[0]) for x in self._sums(every))
-        finest = min(1e-4, RULES.finest * noise / max(before, noise))
-        far_off, near = np.geomspace(2.0, finest, RULES.grid), np.geomspace(1e-9, 0.1, RULES.grid // 2)
-        near = (1.0 - value) * (1.0 + np.concatenate([-near, near]))  # where errors are small
+        _, _, noise = (float(x[0]) for x in self._sums(every))
+        far_off = np.geomspace(2.0, np.finfo(np.float64).eps, GRID)
+        near = (1.0 - value) * (1.0 + np.concatenate([-far_off, far_off]) / 2)  # where errors are small
         shares = np.clip(1.0 - np.sort(np.concatenate([far_off, near, [0.0]]))[::-1], -1.0, 1.0)[:, None]
         off = max(1.0 - float(self.after.sum()) / noise, 0.0)  # of the floor
 

@@ -15,23 +15,10 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.selection.budget import Progress
-from bayessim_mjx.diagnosis.selection.window_subset import looked_at, part
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 from bayessim_mjx.diagnosis.statistics import times
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """How much is simulated."""
-
-    many: int = 400  # starting points, from which on a third of the windows has to do
-    fewest: int = 8  # of them, at least
-    worlds: int = 8192  # simulated between two signs of life, at most: whole calls, even of an accelerator
-    calls: int = 16  # and so many calls, at most
-
-
-SIZES = Sizes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +40,22 @@ class Screened:
     column: Array
     others: tuple[Array, ...] = ()
     whole: float = 0.0
+
+
+def looked_at(fit: Fit, limit: int) -> NDArray[np.int64]:
+    """At most `limit` windows: half with the largest residuals (a limit acts in few), the others spread evenly."""
+    count = len(fit.r)
+    if count <= limit:
+        return np.arange(count)
+    worst = np.argsort(-np.sum(fit.r**2, 1), kind="stable")[: limit // 2]
+    others = np.setdiff1d(np.arange(count), worst)
+    spread = others[np.linspace(0, len(others) - 1, limit - len(worst)).round().astype(int)]
+    return np.sort(np.concatenate([worst, spread]))
+
+
+def part(fit: Fit, own: NDArray[np.int64]) -> Fit:
+    """The fit on some of its windows."""
+    return replace(fit, offsets=fit.offsets[own], r=fit.r[own], A=fit.A[own], B=fit.B[own], weight=fit.weight[own])
 
 
 class Projection:
@@ -134,15 +137,14 @@ def screen(
     fitter: Fitter,
     fit: Fit,
     candidates: Sequence[Candidate],
-    limit: int = 96,
+    limit: int = EFFORT.windows,
     say: Progress = lambda text, done, total: None,
     secants: Secants | None = None,
     over: Callable[[], bool] | None = None,
 ) -> list[Screened]:
     """All candidates on top of `fit`, best first, on at most `limit` windows.
 
-    Where there are many starting points, a third of the windows has to do. Gains are scaled to all windows as if those
-    looked at were typical: good for ranking, too high as an estimate.
+    Gains are scaled to all windows as if those looked at were typical: good for ranking, too high as an estimate.
 
     Args:
         secants: what was simulated before; if empty, it is filled.
@@ -150,9 +152,7 @@ def screen(
     """
     secants = Secants() if secants is None else secants
     if not secants.columns:
-        count = sum(len(candidate.probes) for candidate in candidates)
-        some = limit if count <= SIZES.many else max(limit // 3, SIZES.fewest)
-        _fill(secants, fitter, fit, candidates, some, say, over)
+        _fill(secants, fitter, fit, candidates, limit, say, over)
     return _ordered(projected(fitter, fit, candidates, secants))
 
 
@@ -206,7 +206,7 @@ def simulated(
 ) -> Iterator[tuple[int, Array, Array]]:
     """(candidate, starting point, what it changes of the residual `[w, n]`) for plans of (candidate, point)."""
     some = part(fit, own)
-    at_once = max(min(SIZES.worlds, SIZES.calls * fitter.simulator.lanes) // len(own), 1)
+    at_once = max(EFFORT.batch * fitter.simulator.lanes // len(own), 1)  # whole calls of the compiled program
     for first in range(0, len(plans), at_once):
         if first and over is not None and over():
             return

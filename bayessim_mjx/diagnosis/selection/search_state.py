@@ -13,12 +13,8 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.models import Key, Model
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, FLOOR, PRIORS
 from bayessim_mjx.diagnosis.selection.screen import Screened, Secants
-
-FLOOR = 1.3  # noise standard deviations (rms) up to which an error needs no explanation; docs/decisions/at_noise.md
-EXPECTED = 1.0  # prior number of effects that a simulator lacks; no effect is as likely as one
-LEFT = 1.0  # mean square of start states, in their variances, from which fits with contacts begin at measured ones
-ASTRAY = 10.0  # noise standard deviations (rms) from which on a fit's derivatives change at every step
 
 
 @dataclass(frozen=True)
@@ -26,16 +22,13 @@ class Settings:
     """Budgets of the search, by the robot's size.
 
     Attributes:
-        screened: windows used in screening; iterations, tolerance: of a fit.
-        fresh: base columns are differenced again during a fit if there are at most so many.
+        screened: windows used in screening; iterations: of a fit.
         budget: time that the search may take.
         believed: share of the noise (rms) that is the sensors'; the rest bounds the error of the time step.
     """
 
-    screened: int = 96
-    iterations: int = 12
-    tolerance: float = 5e-3
-    fresh: int = 6
+    screened: int = EFFORT.windows
+    iterations: int = EFFORT.steps
     believed: float = 1.0
     budget: Budget = Budget()
 
@@ -99,29 +92,22 @@ class SearchState:
         A fit that lacks an effect may move its start states farther than their noise. Over contacts no step leads back,
         and the effect would find nothing to explain.
         """
-        if not self.rough or np.mean((fit.offsets / self.fitter.spread) ** 2) < LEFT:
+        if (
+            not self.rough or np.mean((fit.offsets / self.fitter.spread) ** 2) < 1.0
+        ):  # mean square of start states, in variances
             return fit
         if fit not in self._measured:
             self._measured[fit] = self.fitter.begin(fit.coordinates, fit.values)
         return self._measured[fit]
 
     def fresh(self, fit: Fit) -> list[int]:
-        """Columns to difference again: effects' at every step, known parameters' at every third if they are few.
-
-        Far from the logs, where columns change at every step, known parameters' at every step too.
-        """
-        base = len(self.fitter.base)
-        turn = base <= self.settings.fresh and (self.astray(fit) or len(fit.history) % 3 == 0)
-        return list(range(0 if turn else base, len(fit.coordinates)))
-
-    def astray(self, fit: Fit) -> bool:
-        """Whether a fit is so far from the logs that its derivatives hold only where it is."""
-        return fit.cost > ASTRAY**2 * self.noise * len(fit.r)
+        """Columns to difference again at every step: the effects'."""
+        return list(range(len(self.fitter.base), len(fit.coordinates)))
 
 
 def log_prior(key: Key, candidates: int) -> float:
     """Log prior of a set of effects over no effect: every candidate is missing with the same small probability."""
-    odds = EXPECTED / max(candidates - EXPECTED, 1.0)
+    odds = PRIORS.expected / max(candidates - PRIORS.expected, 1.0)
     return len(key) * float(np.log(odds))
 
 

@@ -1,38 +1,43 @@
-"""Successive halving: many fits run in lockstep, those far behind stop early, those close to the best go to the end."""
+"""Successive halving: many fits run in lockstep, those far behind stop early, those close to the best go to the end.
+
+Starts and candidates are ranked on some of the windows, and the best go on with all. All windows are needed to say how
+well a model predicts, fewer to see that it is far behind.
+"""
 
 from __future__ import annotations
 
 import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.selection import window_subset
+from bayessim_mjx.diagnosis.fitting.journal import Remembering
 from bayessim_mjx.diagnosis.selection.budget import SINGLES, Progress
 from bayessim_mjx.diagnosis.selection.models import Key, Model, scored
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT
+from bayessim_mjx.diagnosis.selection.screen import looked_at, part
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 
-BATCH = 12  # models that are fitted in lockstep; `state.keep` is called after each batch
+Array = NDArray[np.float64]
 
 
 class SuccessiveHalving:
     """Starts far behind their candidate's best stop first, then candidates far behind the best candidate.
 
-    A fit that stops keeps the cost that it reached. A fit goes on if its cost still falls fast, or if a step that
-    promised much was refused.
+    After n steps a start has to be within 1 + (c - 1) / c^(n - 1) times its candidate's best cost, c = `Effort.close`,
+    and within c times that limit of the best candidate's: where it is, or after one more step like its last. A fit that
+    stops keeps the cost that it reached.
 
     Args:
         over: whether the time is over.
     """
-
-    STARTS = {1: 4.0, 2: 2.0, 3: 1.3, 5: 1.03}  # steps made -> cost over the best start's
-    CANDIDATES = {2: 8.0, 3: 5.0, 5: 3.0}  # and over the best candidate's
-    FAST = 0.7  # cost after over cost before a step
 
     def __init__(self, over: Callable[[], bool]) -> None:
         self.over = over
@@ -49,16 +54,15 @@ class SuccessiveHalving:
             cost = np.array([fit.cost for fit in fits])
             best = np.array([float(np.min(cost[owner == i])) for i in range(len(starts))])
             self.pace[made] = min(self.pace.get(made, np.inf), float(best.min()))
-            limits = self.STARTS.get(made, np.inf) * best
-            if made in self.CANDIDATES:
-                limits[best > self.CANDIDATES[made] * self.pace[made]] = 0.0
-            return [i for i in running if cost[i] <= limits[owner[i]] or self._falls(fits[i])]
+            behind = 1.0 + (EFFORT.close - 1.0) / EFFORT.close ** (made - 1)
+            limits = behind * np.minimum(best, EFFORT.close * self.pace[made])
+            return [i for i in running if made < 1 or min(cost[i], _next(fits[i])) <= limits[owner[i]]]
 
         return going
 
     def learn(self, fits: Sequence[Fit]) -> None:
         """Take the pace from finished fits. Fits that are read from disk set the same pace as fits that were run."""
-        for made in self.CANDIDATES:
+        for made in range(1, EFFORT.steps + 1):
             costs = [fit.history[min(made, len(fit.history) - 1)] for fit in fits if fit.history]
             self.pace[made] = min([self.pace.get(made, np.inf), *costs])
 
@@ -70,10 +74,13 @@ class SuccessiveHalving:
 
         return going
 
-    def _falls(self, fit: Fit) -> bool:
-        refused = len(fit.history) > 1 and fit.history[-1] == fit.history[-2]
-        fell = len(fit.history) > 1 and fit.history[-1] < self.FAST * fit.history[-2]
-        return fell or (refused and fit.promise > (1 - self.FAST) * fit.cost)
+
+def _next(fit: Fit) -> float:
+    """Cost after one more step that gains the same factor as the last, or what was promised if that was refused."""
+    if len(fit.history) < 2:
+        return np.inf
+    before, now = fit.history[-2:]
+    return fit.cost - fit.promise if before == now else now**2 / before
 
 
 Entries = dict[Key, tuple[list[Fit], tuple[Candidate, ...]]]  # {labels: (a fit per start, effects)}
@@ -99,9 +106,9 @@ def fit_entries(
     total, done = sum(len(several) for several, _ in entries.values()), 0
     every = list(entries.items())
     leading = min((model.fit for model in parents.values()), key=lambda fit: fit.cost, default=state.base.fit)
-    own = window_subset.windows_of(leading)
-    for first in range(0, len(every), BATCH):
-        some = dict(every[first : first + BATCH])
+    own = ranked_on(leading)
+    for first in range(0, len(every), EFFORT.batch):
+        some = dict(every[first : first + EFFORT.batch])
         if part and state.settings.budget.over(part) and (first or part != SINGLES):
             _left_out(state, [effects for _, (_, effects) in every[first:]], label)
             return
@@ -124,9 +131,9 @@ def _fit_batch(
 ) -> None:
     """All starts on a subset of the windows (None: on all); then the best start of each model on all windows."""
     every = [several for several, _ in entries.values()]
-    part = state.fitter if own is None else window_subset.on(state.fitter, own)
-    starts = [f if own is None else window_subset.cut(f, own) for fs in every for f in fs]
-    rules = state.settings.iterations, state.fresh, state.settings.tolerance
+    part = state.fitter if own is None else fitter_on(state.fitter, own)
+    starts = [f if own is None else cut(f, own) for fs in every for f in fs]
+    rules = state.settings.iterations, state.fresh, EFFORT.tolerance
     fits = part.iterate(starts, *rules, progress, halving.among(list(map(len, every))))
     halving.learn(fits)
     rest = iter(fits)
@@ -137,8 +144,8 @@ def _fit_batch(
         gaining = _gaining(state, part, own, best, parents)
         state.vain |= set(entries) - set(gaining)
         halving.least = min(halving.least, *(fit.cost for fit in best.values()))
-        again = [window_subset.back(first[key][1], best[key], own) for key in gaining]
-        close = window_subset.close(np.array([best[key].cost for key in gaining]), halving.least)
+        again = [back(first[key][1], best[key], own) for key in gaining]
+        close = np.array([best[key].cost for key in gaining]) <= EFFORT.close * halving.least
         found = state.fitter.iterate(again, *rules, None, halving.finals(close)) if again else []
         best = dict(zip(gaining, found, strict=True))
     for key, fit in best.items():
@@ -152,7 +159,7 @@ def _gaining(
     share, out = len(own) / len(state.base.fit.r), []
     for key, fit in fits.items():
         parent = parents.get(key)
-        before = np.inf if parent is None else window_subset.cost(part, parent.fit, own)
+        before = np.inf if parent is None else cost_on(part, parent.fit, own)
         if before - fit.cost > share * _least_gain(state, key, parent):
             out.append(key)
     return out
@@ -168,3 +175,49 @@ def _left_out(state: SearchState, models: Sequence[Sequence[Candidate]], label: 
     """Record the models for which no time was left."""
     state.cut_short.update(effects[0].label for effects in models if len(effects) == 1)
     state.skipped[label] = state.skipped.get(label, 0) + len(models)
+
+
+class WindowSubset:
+    """A simulator of the windows `own` of another, for a fitter; both share one compiled program."""
+
+    def __init__(self, simulator: Any, own: NDArray[np.int64]) -> None:
+        self.simulator, self.own, self.physics = simulator, own, simulator.physics
+        self.apart = getattr(simulator, "apart", False)
+        all_of_it = simulator.windows  # its batch stays whole: the simulator has it
+        parts = {name: getattr(all_of_it, name)[own] for name in ("log", "start", "group")}
+        self.windows = replace(all_of_it, **parts)
+
+    def run(self, thetas: Array, offsets: Array | None = None, windows: NDArray[np.int64] | None = None) -> Array:
+        """As `Simulator.run`."""
+        return np.asarray(self.simulator.run(thetas, offsets, self.own if windows is None else self.own[windows]))
+
+
+def ranked_on(fit: Fit) -> NDArray[np.int64] | None:
+    """The windows on which extensions of a fit are ranked; None: all, as there are few."""
+    return looked_at(fit, EFFORT.windows // 2) if len(fit.r) >= EFFORT.windows else None
+
+
+def fitter_on(fitter: Fitter, own: NDArray[np.int64]) -> Fitter:
+    """The fitter on some of its windows; it uses the same journal, but stores no columns there."""
+    some: Any = WindowSubset(fitter.simulator, own)
+    plain = Fitter(some, fitter.base, fitter.theta)
+    journal = fitter.journal if isinstance(fitter, Remembering) else None
+    return plain if journal is None else Remembering(plain, journal, bare=True)
+
+
+def cut(fit: Fit, own: NDArray[np.int64]) -> Fit:
+    """The start of a fit to some of the windows."""
+    return replace(part(fit, own), cost=np.inf, history=(), reach=np.ones(1))
+
+
+def cost_on(part: Fitter, fit: Fit, own: NDArray[np.int64]) -> float:
+    """The cost on some windows of a fit to all windows."""
+    some = cut(fit, own)
+    return part.cost(some, some.r, some.offsets, some.values)
+
+
+def back(fit: Fit, ranked: Fit, own: NDArray[np.int64]) -> Fit:
+    """The start of a fit to all windows at the values of `ranked`, a fit to some; its first step gives residuals."""
+    offsets = fit.offsets.copy()
+    offsets[own] = ranked.offsets
+    return replace(fit, values=ranked.values, offsets=offsets, cost=np.inf, history=(), reach=np.ones(1))

@@ -46,9 +46,8 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         about: what was diagnosed, see `Diagnosis`; file: name of the proposal's command file, where there is one.
     """
     setup, selection, model = found.setup, found.selection, found.model
-    timestep = float(setup.robot.mj_model.opt.timestep) * (setup.discretisation.factor if setup.discretisation else 1)
     own = selection.estimated
-    together = own.covariance + np.diag(systematic(model, timestep, selection.state.gap(model).left) ** 2)
+    together = own.covariance + np.diag(systematic(model, setup.fitter.simulator.windows.dt) ** 2)
     finer = found.part(AtFinerSteps)
     steps = finer.notes(found, together) if finer else []
     base = len(setup.fitter.base)

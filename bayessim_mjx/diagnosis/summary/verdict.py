@@ -17,7 +17,7 @@ from bayessim_mjx.diagnosis.gap import of_one
 from bayessim_mjx.diagnosis.residual.origin import Origin, origin
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.search_state import FLOOR
+from bayessim_mjx.diagnosis.selection.numbers import FLOOR
 from bayessim_mjx.diagnosis.summary.whole_logs import Whole
 from bayessim_mjx.logs.log import Channels
 

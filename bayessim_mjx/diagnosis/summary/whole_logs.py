@@ -16,7 +16,7 @@ from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
-from bayessim_mjx.diagnosis.selection.models import KNOWN, Model, of_noise, systematic
+from bayessim_mjx.diagnosis.selection.models import Model, of_noise, systematic
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.quantities import percent
 
@@ -173,9 +173,9 @@ def _drawn(
 
 def _root(found: Findings, model: Model) -> Array:
     """Square root `[k, k]` of the covariance of parameters whose law is right: noise, and what simulators differ by."""
-    setup, known = found.setup, KNOWN
-    own = systematic(model, float(setup.physics.mj_model.opt.timestep), known=known)
-    return statistics.root(of_noise(setup.fitter, model) + np.diag(own**2))
+    fitter = found.setup.fitter
+    own = systematic(model, fitter.simulator.windows.dt, known=True)
+    return statistics.root(of_noise(fitter, model) + np.diag(own**2))
 
 
 def _values(found: Findings, stage: _Stage, w: int) -> Array:

@@ -16,6 +16,7 @@ from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.fits import begin
 from bayessim_mjx.diagnosis.selection.models import BASE
+from bayessim_mjx.diagnosis.selection.numbers import PRIORS
 from bayessim_mjx.parameters.parameter import Parameter
 from tests.diagnosis import pendulums
 
@@ -35,7 +36,7 @@ def test_each_kind_of_sensor_has_a_lag_of_its_own(monkeypatch):
     fitter = SimpleNamespace(
         rate=lambda: rate, used=np.ones(2, bool), simulator=SimpleNamespace(nv=1, windows=windows)
     )  # fmt: skip
-    unit = doubts.TIMING * 0.01
+    unit = PRIORS.times * 0.01
     positions, velocities = np.moveaxis(doubts.found(fitter, D, B).columns[0], 1, 0) / unit
     assert positions == pytest.approx([2 - 3, 0, 2 - 5, 0, 2 - 9, 0])
     assert velocities == pytest.approx([1.0, -150, 2.0, -300, 3.0, -400])

@@ -9,10 +9,12 @@ from scipy import integrate, stats
 from scipy.special import logsumexp
 
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY, SURE
+from bayessim_mjx.diagnosis.evidence import parameters
 from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, marginal
-from bayessim_mjx.diagnosis.evidence.parameters import SIZES, belief_of, integrated
+from bayessim_mjx.diagnosis.evidence.parameters import belief_of, integrated
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
+from bayessim_mjx.diagnosis.selection.numbers import PRIORS
 from tests.diagnosis.evidence.linear import draw
 
 HYPER = Hyper(np.array([0.02]), 4.0, np.array([1.0, 1.2]))
@@ -116,7 +118,7 @@ def test_an_effect_of_any_size_against_quadrature(truth):
     top = max(likelihood(there, p) for p in np.linspace(0, 2, 2001))
 
     def density(p):
-        return np.mean([stats.truncnorm(0.0, 1.0 / size, scale=20.0 * size).pdf(p) for size in SIZES])
+        return np.mean([stats.truncnorm(0.0, 1.0 / size, scale=20.0 * size).pdf(p) for size in PRIORS.sizes])
 
     whole = integrate.quad(lambda p: density(p) * np.exp(likelihood(there, p) - top), 0, 2, limit=400)[0]
     found = integrated(fit, learnt, [{0: False}])
@@ -137,14 +139,23 @@ def test_a_number_of_an_effect_may_be_neutral(truth, shapes):
     there = marginal(case.windows(), HYPER)
     learnt = Learnt(HYPER, belief_of(whole).best(there.Q.sum(0)), there, 0.0)
     each = []
-    for n, size in itertools.product((1, 2, 3), SIZES):
+    for n, size in itertools.product((1, 2, 3), PRIORS.sizes):
         sized = [c if i in (0, *shapes) else replace(c, precision=size**-2) for i, c in enumerate(numbers)]
         for some in itertools.combinations((1, 2, 3), n):
             if not {*some} <= {*shapes}:
                 own = [0, *some]
                 each.append(evidence(case, fitted([sized[i] for i in own], np.zeros(len(own))), own)[0].nats)
     found = integrated(whole, learnt, [{i: i in shapes for i in (1, 2, 3)}])
-    assert len(each) == len(SIZES) * {0: 7, 1: 6, 2: 4}[len(shapes)]
+    assert len(each) == len(PRIORS.sizes) * {0: 7, 1: 6, 2: 4}[len(shapes)]
     assert found.nats == pytest.approx(logsumexp(each) - np.log(len(each)), abs=1e-3)
     gained = found.nats - integrated(whole, learnt).nats
     assert gained > 1.0 if truth[1] == 0 else gained < 0.0
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.3, 3.0, 100.0, 1e6])
+def test_the_depth_of_a_layer_beside_a_bound(slope):
+    """Against quadrature; far from the bound it is that of an exponential density, sqrt(2) / slope."""
+    curvature, end = 4.0, min(10.0, 50.0 / max(slope, 1e-9))
+    weight = [integrate.quad(lambda t, n=n: t**n * np.exp(-slope * t - 2.0 * t * t), 0, end)[0] for n in (0, 2)]
+    assert parameters._depth(-slope, curvature) == pytest.approx(np.sqrt(weight[1] / weight[0]), rel=1e-6)
+    assert slope < 1e3 or parameters._depth(slope, curvature) == pytest.approx(np.sqrt(2) / slope, rel=1e-6)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.evidence import sets
-from bayessim_mjx.diagnosis.evidence.sets import RELEVANCE, core
+from bayessim_mjx.diagnosis.evidence.sets import core
+from bayessim_mjx.diagnosis.selection.numbers import RELEVANCE
 from bayessim_mjx.diagnosis.selection.search_state import log_prior
 
 A, B, AB, NONE = frozenset("a"), frozenset("b"), frozenset("ab"), frozenset()

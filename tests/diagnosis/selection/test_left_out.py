@@ -41,7 +41,7 @@ def test_what_there_was_no_time_for_is_told_in_words():
 
 
 def test_parts_end_one_after_the_other_and_without_a_limit_never():
-    clock = iter([29.0, 40.0, 54.0])
+    clock = iter([42.0, 43.0, 70.0])
     budget = Budget(100.0, 0.0, lambda: next(clock))
     assert [budget.over(part) for part in ("single effects", "single effects", "leaving out")] == [False, True, False]
     assert list(ENDS.values()) == sorted(ENDS.values())
@@ -50,7 +50,7 @@ def test_parts_end_one_after_the_other_and_without_a_limit_never():
 
 
 def test_parts_share_what_is_left_once_the_simulator_is_compiled():
-    """Of 100 s 40 are gone: single effects end 60 * .35 s after them, and with all of it gone nothing has time."""
+    """Of 100 s 40 are gone: parts have shares of 60 s after them, and with all of it gone nothing has time."""
     now = {"s": 40.0}
     budget = Budget(100.0, 0.0, lambda: now["s"]).searching()
     assert budget.left("single effects") == pytest.approx(60 * ENDS["single effects"])
@@ -101,10 +101,10 @@ class Slow:
 
 
 @pytest.mark.parametrize(
-    ("limit", "steps", "refreshed", "windows"), [(600.0, 6, 1, 8), (1e9, 20, 2, 20), (4000.0, 20, 2, 20)]
+    ("limit", "steps", "refreshed", "windows"), [(630.0, 9, 1, 11), (1e9, 24, 2, 20), (4000.0, 24, 2, 20)]
 )
 def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(monkeypatch, limit, steps, refreshed, windows):
-    """Ten steps twice where there is time for them; .1 of 600 s are six. Windows are then screened as time allows."""
+    """Twelve steps twice where there is time for them; a seventh of 630 s is nine. Windows are then as time allows."""
     fitter, seen = Slow(), {}
     settings = Settings(budget=Budget(limit, 0.0, lambda: fitter.seconds), screened=20)
     candidates = [SimpleNamespace(probes=np.zeros((40, 1)))] * 2
@@ -119,4 +119,4 @@ def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(monkeyp
     monkeypatch.setattr(fits.SearchState, "begun", lambda pool, fit: fit)
     fits.begin(fitter, candidates, settings)
     assert (seen["steps"], fitter.refreshed) == (steps, refreshed)
-    assert seen["screened"] == windows  # 48 s for 80 points at .1 s a window are 6, but never fewer than 8
+    assert seen["screened"] == windows  # 90 s for 80 points at .1 s a window are 11

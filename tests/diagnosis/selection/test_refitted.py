@@ -10,6 +10,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.selection import heldout
 from bayessim_mjx.diagnosis.selection.models import scored
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 
 MOTION = np.sin(np.arange(8 * 20) * 0.7).reshape(8, 20)  # of eight windows
 GROUP = np.repeat(np.arange(4), 2)
@@ -71,7 +72,7 @@ def test_fits_without_a_condition_come_to_their_end_where_one_linear_step_does_n
     before = fitter.simulator.rollouts
     (new,) = heldout.refitted(fitter, [model])
     made = fitter.simulator.rollouts - before  # of all windows, as long as a step promises something
-    assert 4 < made <= 4 * heldout.RULES.steps
+    assert 4 < made <= 4 * EFFORT.rounds
     exact = np.array([alone(fitter, model, g) for g in range(4)])
     linear, again = np.abs(model.estimates[:, 0] - exact), np.abs(new.estimates[:, 0] - exact)
     assert linear.max() > 0.05 and again.max() < linear.max() / 5

@@ -97,7 +97,7 @@ def test_where_time_ends_first_every_candidate_was_looked_at_before_any_a_second
     """The middle of each grid comes first, then points far from it; with time for all the result is the same."""
     truth, setup, fitter, fit, whole = screened
     module = importlib.import_module("bayessim_mjx.diagnosis.selection.screen")
-    monkeypatch.setattr(module, "SIZES", replace(module.SIZES, worlds=fitter.simulator.lanes))
+    monkeypatch.setattr(module, "EFFORT", replace(module.EFFORT, sets=(1,)))
     each = max(fitter.simulator.lanes // len(fit.r), 1)
     count = len(setup.candidates)
     looks = -(-count // each) + 1  # parts, of which the last ones begin the second round
@@ -130,13 +130,3 @@ def test_what_was_simulated_on_one_fit_is_projected_on_another_without_a_simulat
     found = screen(fitter, fit, setup.candidates, 24, secants=secants)
     assert fitter.simulator.rollouts == before
     assert [(s.candidate.label, s.gain) for s in found] == [(s.candidate.label, s.gain) for s in first]
-
-
-def test_of_many_starting_points_a_third_of_the_windows_is_simulated(screened, monkeypatch):
-    truth, setup, fitter, fit, _ = screened
-    module = importlib.import_module("bayessim_mjx.diagnosis.selection.screen")
-    monkeypatch.setattr(module, "SIZES", replace(module.SIZES, many=0))
-    before = fitter.simulator.rollouts
-    found = screen(fitter, fit, setup.candidates, 24)
-    assert fitter.simulator.rollouts - before == 8 * sum(len(c.probes) for c in setup.candidates)
-    assert found[0].candidate.effect == truth

@@ -15,10 +15,15 @@ def test_starts_behind_their_own_best_stop_and_candidates_far_behind_the_best():
     halving = SuccessiveHalving(lambda: False)
     fits = [fit(90, 10), fit(95, 39), fit(99, 41), fit(200, 170)]  # three starts of one candidate, one of another
     going = halving.among([3, 1])
-    assert going(1, fits, range(4)) == [0, 1, 2, 3]  # all still fall fast, but for the last, which is alone
-    slow = [fit(10, 10), fit(41, 39), fit(42, 41), fit(171, 170)]
+    assert going(1, fits, range(4)) == [0, 1, 2, 3]  # one more step like the last brings the third and the last close
+    slow = [fit(10, 10), fit(41, 39), fit(42.5, 42), fit(150, 149)]
     assert going(1, slow, range(4)) == [0, 1, 3]
-    assert going(2, slow, range(4)) == [0]  # another candidate, 17 times behind
+    assert going(2, slow, range(4)) == [0]  # 1.75 times the best start, seven times the best candidate
+    assert going(2, [fit(10, 10), fit(40, 26), fit(41, 26.7), fit(90, 80)], range(4)) == [
+        0,
+        1,
+        2,
+    ]  # 26.7^2 / 41 is 17.4
     assert SuccessiveHalving(lambda: True).among([1])(1, [fit(1, 1)], [0]) == []
 
 
@@ -30,8 +35,6 @@ def test_fits_from_the_disk_set_the_same_pace_as_those_that_were_made():
         made.among([1, 1, 1])(step, now, range(3))
     read = SuccessiveHalving(lambda: False)
     read.learn([fit(*row) for row in rows])
-    assert {at: read.pace[at] for at in SuccessiveHalving.CANDIDATES} == {
-        at: made.pace[at] for at in SuccessiveHalving.CANDIDATES
-    }
+    assert {at: read.pace[at] for at in range(1, 6)} == {at: made.pace[at] for at in range(1, 6)}
     made.learn([fit(*row) for row in rows])
-    assert {at: made.pace[at] for at in SuccessiveHalving.CANDIDATES} == pytest.approx(read.pace)
+    assert {at: made.pace[at] for at in read.pace} == pytest.approx(read.pace)

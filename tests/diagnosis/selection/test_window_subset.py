@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.selection import successive_halving as fitting
-from bayessim_mjx.diagnosis.selection import window_subset
 from bayessim_mjx.diagnosis.selection.models import scored
 from tests.diagnosis.selection.test_bounds import pool_of, silent
 
@@ -24,7 +23,7 @@ def fitted(true=0.4, starts=(0.9, 0.1, 0.6)):
 
 def test_fits_on_some_windows_come_to_those_on_all_of_them(monkeypatch):
     whole, many = fitted()
-    monkeypatch.setattr(window_subset, "SIZES", dataclasses.replace(window_subset.SIZES, windows=2, least=8))
+    monkeypatch.setattr(fitting, "EFFORT", dataclasses.replace(fitting.EFFORT, windows=4))
     some, fewer = fitted()
     assert fewer < 0.8 * many
     assert some.fit.values == pytest.approx(whole.fit.values, abs=1e-4)
@@ -32,7 +31,7 @@ def test_fits_on_some_windows_come_to_those_on_all_of_them(monkeypatch):
 
 
 def test_what_gains_less_than_its_prior_odds_on_some_windows_is_no_model(monkeypatch):
-    monkeypatch.setattr(window_subset, "SIZES", dataclasses.replace(window_subset.SIZES, windows=2, least=8))
+    monkeypatch.setattr(fitting, "EFFORT", dataclasses.replace(fitting.EFFORT, windows=4))
     kept = {}
     for true in (0.0, 0.4):  # without the effect, and with it
         pool, model = pool_of(true)
@@ -49,14 +48,10 @@ def test_what_gains_less_than_its_prior_odds_on_some_windows_is_no_model(monkeyp
 def test_a_part_of_a_fit_and_back():
     pool, model = pool_of(0.4)
     own = np.array([1, 4])
-    part = window_subset.cut(model.fit, own)
+    part = fitting.cut(model.fit, own)
     assert part.r.shape == (2, 20) and part.A.shape == (2, 20, 1) and part.offsets.shape == (2, 2)
     moved = dataclasses.replace(part, values=np.array([0.3]), offsets=np.ones((2, 2)))
-    fit = window_subset.back(model.fit, moved, own)
+    fit = fitting.back(model.fit, moved, own)
     assert fit.values[0] == 0.3 and fit.offsets[own].min() == 1.0 and len(fit.r) == 8
     assert np.array_equal(np.delete(fit.offsets, own, 0), np.delete(model.fit.offsets, own, 0))
-    assert window_subset.on(pool.fitter, own).whiten(np.zeros((2, 20, 2))).shape == (2, 20)
-
-
-def test_those_far_behind_do_not_go_on():
-    assert window_subset.close(np.array([1.0, 3.0, 50.0]), 1.0).tolist() == [True, True, False]
+    assert fitting.fitter_on(pool.fitter, own).whiten(np.zeros((2, 20, 2))).shape == (2, 20)
