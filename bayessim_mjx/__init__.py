@@ -12,6 +12,7 @@ The public names, by room (imported when first used, so that the commands start 
     logs          Log, read_logs                           recorded motion
     rl.pretrained pretrained                               a policy that comes with the package
     diagnose      diagnose                                 logs and a simulator -> Diagnosis (also a command's module)
+                  robot                                    the simulator under diagnosis, of a file, task or model
 
 Rooms to import as modules: rollout (rollout, replay), rl (train, evaluate), inference (fit, condition, combine),
 loop (make, init, run).
@@ -32,12 +33,13 @@ _ROOMS = {
     "env": ("Env", "State", "Task"),
     "logs": ("Log", "read_logs"),
     "rl.pretrained": ("pretrained",),
+    "diagnose": ("robot",),
 }
 _WHERE = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = [
     "Distribution", "Effect", "Env", "Log", "Parameter", "ParameterSpace", "Physics", "State", "Task", "World",
-    "control_step", "diagnose", "load", "make", "names", "pretrained", "read_logs",
+    "control_step", "diagnose", "load", "make", "names", "pretrained", "read_logs", "robot",
 ]  # fmt: skip
 
 

@@ -4,7 +4,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Any
 
 from bayessim_mjx import cli
 from bayessim_mjx.config.settings import SEEDS
@@ -27,57 +27,49 @@ def _share(text: str) -> float:
 
 def _parser() -> cli.PlainParser:
     parser = cli.PlainParser(
-        prog=cli.prog_of("blind").replace("bayessim_mjx.blind", "bayessim_mjx.blind_check"),
+        "blind",
         description="Hide effects of known strength in a finer simulation of your robot, moved as in your logs, and "
         "see which of them a diagnosis finds.",
-        usage="%(prog)s [options]\n       (--task NAME | --model FILE) [--data PATH [PATH ...]]",
+        usage="%(prog)s [options]\n       (--task TASK | --model FILE) [--data PATH [PATH ...]]",
     )
-    parser.add_argument("--task", metavar="NAME", help="a task of this library (main --list_tasks prints them)")
-    parser.add_argument("--model", metavar="FILE", help="an MJCF model with actuated hinge or slide joints")
-    parser.add_argument(
-        "--data", metavar="PATH", nargs="+", default=[],
-        help="log files, or folders of them: conditions, commands, rates and noise are taken from them (default: a "
-        "menu of motions within the model's limits)",
-    )  # fmt: skip
-    parser.add_argument("--map", metavar="FILE", default="", help="YAML file that maps the columns of the logs")
-    parser.add_argument(
-        "--effects", metavar="LIST", default="all",
-        help="effects to hide, separated by commas (default: all that a diagnosis tries unasked)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--cases", metavar="N", type=cli.whole(1, MOST), default=CASES, help=f"cases in all (default: {CASES})"
+    robot = parser.group("robot and logs")
+    robot.add_argument("--task", metavar="TASK", type=cli.task, help="name of a task, or file.py:Class")
+    robot.add_argument("--model", metavar="FILE", help="an MJCF model with actuated hinge or slide joints")
+    text = (
+        "log files, or folders of them: conditions, commands, rates and noise are taken from them (default: a menu of "
+        "motions within the model's limits)"
     )
-    parser.add_argument(
-        "--minutes",
-        metavar="M",
-        type=cli.positive("minutes"),
-        help="begin no further case after this time; the next start goes on",
-    )
-    parser.add_argument(
-        "--accuracy", metavar="SHARE", type=_share, default=0.05,
-        help="how accurate data-sheet values are (standard deviation; default: 5%%)",
-    )  # fmt: skip
-    parser.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed (default: 0)")
-    parser.add_argument(
-        "--workers",
-        metavar="N",
-        type=cli.whole(1, 1024),
-        help="cases at a time, which share the cores out (default: as many as cores, and as need not wait for others)",
-    )
-    parser.add_argument("--out", metavar="DIR", default="blind", help="folder of the check (default: blind)")
-    parser.add_argument(
-        "--command", metavar="WORDS", default="",
-        help="another diagnosis: a command with {data} and {out}, and {model}, that writes {out}/diagnosis.json",
-    )  # fmt: skip
-    parser.add_argument(
-        "--no_sandbox", action="store_true",
-        help="let the diagnosis read the whole disk, the truths too (default: it cannot, where Linux has Landlock)",
-    )  # fmt: skip
-    parser.add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
-    parser.add_argument(
-        "--more", nargs=argparse.REMAINDER, default=[], metavar="FLAG", help="further flags of diagnose; comes last"
-    )
+    robot.add_argument("--data", metavar="PATH", nargs="+", default=[], help=text)
+    robot.add_argument("--map", metavar="FILE", default="", help="YAML file that maps the columns of the logs")
+    parser.group("output").add_argument("--out", metavar="DIR", default="blind", help="folder of the check")
+    _cases(parser.group("cases"))
+    _diagnosis(parser.group("diagnosis"))
+    parser.group("output").add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
     return parser
+
+
+def _cases(group: Any) -> None:
+    """Which cases there are, and how many at a time."""
+    text = "effects to hide, separated by commas (default: all that a diagnosis tries unasked)"
+    group.add_argument("--effects", metavar="LIST", default="all", help=text)
+    group.add_argument("--cases", metavar="N", type=cli.whole(1, MOST), default=CASES, help="cases in all")
+    text = "begin no further case after this time; the next start goes on (default: no limit)"
+    group.add_argument("--minutes", metavar="M", type=cli.positive("minutes"), help=text)
+    text = "standard deviation of data-sheet values (default: 5%%)"
+    group.add_argument("--accuracy", metavar="SHARE", type=_share, default=0.05, help=text)
+    group.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed")
+    text = "cases at a time, which share the cores out (default: as many as cores, and as need not wait for others)"
+    group.add_argument("--workers", metavar="N", type=cli.whole(1, 1024), help=text)
+
+
+def _diagnosis(group: Any) -> None:
+    """Which diagnosis is tested."""
+    text = "another diagnosis: a command with {data} and {out}, and {model}, that writes {out}/diagnosis.json"
+    group.add_argument("--command", metavar="WORDS", default="", help=text)
+    text = "let the diagnosis read the whole disk, the truths too (default: it cannot, where Linux has Landlock)"
+    group.add_argument("--no_sandbox", action="store_true", help=text)
+    text = "further flags of diagnose; comes last"
+    group.add_argument("--more", nargs=argparse.REMAINDER, default=[], metavar="FLAG", help=text)
 
 
 def _checked(args: argparse.Namespace) -> None:
@@ -91,8 +83,7 @@ def _checked(args: argparse.Namespace) -> None:
         raise UserError(f"--command {args.command!r}: {error}; allowed: words as a shell takes them") from None
     if args.command and args.more:
         raise UserError("--more: these are flags of our own diagnosis; put those of another one into --command")
-    if Path(args.out).exists() and not Path(args.out).is_dir():
-        raise UserError(f"--out {args.out}: there is a file of that name; give a folder")
+    cli.writable(args.out, "--out")
 
 
 def _blind(argv: Sequence[str] | None) -> int:
@@ -101,7 +92,7 @@ def _blind(argv: Sequence[str] | None) -> int:
     from bayessim_mjx.blind.check import Check, effects_of
     from bayessim_mjx.blind.runner import Limits, run
     from bayessim_mjx.monitor.console import Console
-    from bayessim_mjx.monitor.stages import stages
+    from bayessim_mjx.progress import stages
 
     names = effects_of(args.effects)
     check = Check(

@@ -1,4 +1,4 @@
-"""`python -m bayessim_mjx.calibrate --run RUN`: how far the posterior of a finished run can be trusted."""
+"""`bayessim-mjx calibrate --run RUN`: how far the posterior of a finished run can be trusted."""
 
 from __future__ import annotations
 
@@ -29,35 +29,25 @@ ADVICE = {
 
 
 def _parser() -> cli.PlainParser:
-    parser = cli.PlainParser(
-        prog=cli.prog_of("calibrate"),
-        description="Test a finished run's posterior on fresh simulations, and whether real motion looks like them.",
-        usage="%(prog)s --run RUN [options]",
-    )
-    parser.add_argument("--run", metavar="RUN", required=True, help="folder of the run")
-    parser.add_argument(
-        "--checkpoint", metavar="WHICH", default="latest", help="latest, best or a step number (default: latest)"
-    )
-    parser.add_argument(
-        "--pairs",
-        metavar="N",
-        type=cli.whole(-COUNT, COUNT),
-        default=1000,
-        help="number of fresh simulated trajectories (default: 1000)",
-    )
-    parser.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed (default: 0)")
-    parser.add_argument("--device", metavar="NAME", help="auto, cpu or gpu (default: that of the run)")
-    parser.add_argument("--cache_dir", metavar="DIR", help="folder of compiled programs, or off")
-    parser.trusting()
+    about = "Test a finished run's posterior on fresh simulations, and whether real motion looks like them."
+    parser = cli.PlainParser("calibrate", description=about, usage="%(prog)s --run RUN [options]")
+    tests, computing = parser.group("test"), parser.group("computing")
+    tests.add_argument("--run", metavar="RUN", required=True, help="folder of the run")
+    tests.add_argument("--checkpoint", metavar="WHICH", default="latest", help="latest, best or a step number")
+    text = "number of fresh simulated trajectories"
+    tests.add_argument("--pairs", metavar="N", type=cli.whole(-COUNT, COUNT), default=1000, help=text)
+    tests.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed")
+    parser.trusting("test")
+    computing.add_argument("--device", metavar="NAME", help="auto, cpu or gpu (default: that of the run)")
+    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"
+    computing.add_argument("--cache_dir", metavar="DIR", help=text)
     return parser
 
 
 def _settings(args: argparse.Namespace) -> tuple[Config, Any]:
-    from bayessim_mjx.runs import Run
-
     if args.pairs < 40:
         raise UserError(f"--pairs {args.pairs}: at least 40")
-    run = Run.open(args.run)
+    run = cli.open_run(args.run, "--run")
     top = {key: getattr(args, key) for key in ("device", "cache_dir") if getattr(args, key) is not None}
     config = dataclasses.replace(run.config, **top)
     if config.bayessim.modelClass is None:

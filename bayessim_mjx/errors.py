@@ -7,6 +7,7 @@ from collections.abc import Iterable
 # too long. (An OSError of another kind, such as a file that ought to be there, is a bug.)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _REFUSED = (*_FULL, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EMFILE, errno.ENFILE, errno.EIO)
+MANY = 20  # names, at most, that are listed beside a close one: about four lines of a terminal
 _WORDS = ("no space left", "disk quota", "file too large")  # of libraries that report it as an error of their own
 
 
@@ -25,13 +26,14 @@ def nearest(given: str, names: Iterable[str], n: int = 3, cutoff: float = 0.6) -
     return difflib.get_close_matches(given, list(names), n, cutoff)
 
 
-def unknown(what: str, given: str, allowed: Iterable[str]) -> UserError:
-    """The error for a name that does not exist: with the close ones first, then all allowed."""
+def unknown(what: str, given: str, allowed: Iterable[str], page: str = "") -> UserError:
+    """The error for a name that does not exist: the close ones first; then all, or of many the page that lists them."""
     names = list(allowed)
     last = {n.rpartition(".")[2].lower(): n for n in names}
     close = [last[n] for n in nearest(given.rpartition(".")[2].lower(), last)]
     hint = f" Did you mean {' or '.join(close)}?" if close else ""
-    return UserError(f"{what} {given!r} is unknown.{hint} Allowed: {', '.join(names)}")
+    allowed = f"those in {page}" if page and close and len(names) > MANY else ", ".join(names)
+    return UserError(f"{what} {given!r} is unknown.{hint} Allowed: {allowed}")
 
 
 def disk_is_full(error: BaseException) -> bool:

@@ -1,4 +1,4 @@
-"""`python -m bayessim_mjx.gap_loop --task T --diagnosis DIR (--real LOGS | --surrogate FILE)`: worth of a correction.
+"""`bayessim-mjx gap-loop --task T --diagnosis DIR (--real LOGS | --surrogate FILE)`: worth of a correction.
 
 Trains a policy on the simulator as it was and one on the corrected simulator, and says what return each is predicted to
 reach, what it reaches on the surrogate real, and what retraining recovers (see docs/diagnosis.md).
@@ -25,56 +25,42 @@ WITHOUT = ("--max_iterations", "--video", "--video_length", "--video_interval", 
 
 
 def _parser() -> cli.Parser:
-    parser = cli.Parser("gap_loop", DESCRIPTION, without=WITHOUT, unused=("bayessim", "real", "monitor"))
-    parser.add_argument("--diagnosis", metavar="DIR", help="folder that bayessim_mjx.diagnose wrote")
-    parser.add_argument(
-        "--timestep",
-        type=float,
-        metavar="S",
-        help="time step of the corrected simulator in seconds (default: that of the task, or the one of the diagnosis "
-        "where it found the task's own to err by more than is tolerated at a joint)",
+    parser = cli.Parser("gap-loop", DESCRIPTION, without=WITHOUT, unused=("bayessim", "real", "monitor"))
+    gap, real, trained = parser.group("diagnosis"), parser.group("real system"), parser.group("training")
+    gap.add_argument("--diagnosis", metavar="DIR", help="folder that bayessim-mjx diagnose wrote")
+    gap.add_argument("--parameters", metavar="FILE", help="the --parameters file that the diagnosis was given")
+    text = (
+        "time step of the corrected simulator in seconds (default: that of the task, or the one of the diagnosis where "
+        "it found the task's own to err by more than is tolerated at a joint)"
     )
-    parser.add_argument(
-        "--surrogate",
-        metavar="FILE",
-        help="effects.yaml with the hidden truth of a simulated stand-in for the real system",
-    )
-    parser.add_argument(
-        "--surrogate_timestep",
-        type=float,
-        metavar="S",
-        help="time step of that stand-in in seconds (default: that of the task)",
-    )
-    parser.add_argument(
-        "--real", metavar="LOGS", nargs="+", help="logs of the real system; returns are then predicted, not measured"
-    )
-    parser.add_argument("--parameters", metavar="FILE", help="the --parameters file that the diagnosis was given")
-    parser.add_argument(
-        "--iterations",
-        metavar="N",
-        type=cli.integer,
-        help="PPO iterations of each policy (default: ppo.max_iterations)",
-    )
-    parser.add_argument(
-        "--seeds", metavar="N", type=cli.integer, default=1, help="number of policies of each kind (default: 1)"
-    )
-    parser.add_argument(
-        "--episodes", metavar="N", type=cli.integer, default=200, help="episodes in each evaluation (default: 200)"
-    )
-    parser.add_argument("--out", metavar="DIR", help="folder for results and policies (default: <diagnosis>/gap_loop)")
+    gap.add_argument("--timestep", type=float, metavar="S", help=text)
+    text = "logs of the real system; returns are then predicted, not measured"
+    real.add_argument("--real", metavar="LOGS", nargs="+", help=text)
+    text = "effects.yaml with the hidden truth of a simulated stand-in for the real system"
+    real.add_argument("--surrogate", metavar="FILE", help=text)
+    text = "time step of that stand-in in seconds (default: that of the task)"
+    real.add_argument("--surrogate_timestep", type=float, metavar="S", help=text)
+    text = "PPO iterations of each policy (default: ppo.max_iterations)"
+    trained.add_argument("--iterations", metavar="N", type=cli.integer, help=text)
+    trained.add_argument("--seeds", metavar="N", type=cli.integer, default=1, help="number of policies of each kind")
+    trained.add_argument("--episodes", metavar="N", type=cli.integer, default=200, help="episodes in each evaluation")
+    text = "folder for results and policies (default: <diagnosis>/gap_loop)"
+    parser.group("output").add_argument("--out", metavar="DIR", help=text)
     return parser
 
 
 def _check(args: argparse.Namespace) -> None:
     """What can be refused before anything is loaded."""
     if not args.diagnosis:
-        raise UserError("--diagnosis is missing: give the folder that bayessim_mjx.diagnose wrote")
+        raise UserError("--diagnosis is missing: give the folder that bayessim-mjx diagnose wrote")
     if not (Path(args.diagnosis) / "diagnosis.json").is_file():
         raise UserError(
-            f"--diagnosis {args.diagnosis}: no diagnosis.json in it; give the --out of bayessim_mjx.diagnose"
+            f"--diagnosis {args.diagnosis}: no diagnosis.json in it; give the --out of bayessim-mjx diagnose"
         )
     if bool(args.real) == bool(args.surrogate):
         raise UserError("give one of --surrogate FILE (a stand-in for the real system) and --real LOGS")
+    if args.out:
+        cli.writable(args.out, "--out")
     if args.surrogate and not Path(args.surrogate).is_file():
         raise UserError(f"--surrogate {args.surrogate}: no such file; expected the hidden truth as an effects.yaml")
     for flag, least in (("seeds", 1), ("episodes", 2), ("iterations", 1)):

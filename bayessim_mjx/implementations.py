@@ -26,24 +26,24 @@ ACTUAL = (UserError, NotImplementedError)  # how a model is refused, by us or by
 
 def _parser() -> cli.PlainParser:
     parser = cli.PlainParser(
-        prog=cli.prog_of("implementations"),
+        "implementations",
         description="Measure whether MJX's JAX implementation or MuJoCo Warp simulates a task faster on this device. "
         "env.impl=auto goes by it from then on.",
-        usage="%(prog)s --task NAME [options]",
+        usage="%(prog)s --task TASK [options]",
     )
-    parser.add_argument("--task", metavar="NAME", required=True, help="a task of this library (main --list_tasks)")
-    parser.add_argument(
-        "--num_envs", metavar="N", nargs="+", type=cli.whole(1, COUNT),
-        help="numbers of worlds to measure with (default: the task's own)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--seconds", metavar="S", type=cli.positive("seconds"), default=SECONDS,
-        help=f"for all rollouts together, without compiling (default: {SECONDS:.0f})",
-    )  # fmt: skip
-    parser.add_argument("--forget", action="store_true", help="remove what was measured for the task, and stop")
-    parser.add_argument("--device", metavar="NAME", help="auto, cpu, gpu, gpu:1 or cuda:0 (default: auto)")
-    parser.add_argument("--cache_dir", metavar="DIR", help="folder of compiled programs, or off")
-    parser.add_argument("--headless", action="store_true", help="plain lines, without colours")
+    measured, computing = parser.group("measurement"), parser.group("computing")
+    text = "name of a task, or file.py:Class (bayessim-mjx main --list_tasks)"
+    measured.add_argument("--task", metavar="TASK", type=cli.task, required=True, help=text)
+    text = "numbers of worlds to measure with (default: the task's)"
+    measured.add_argument("--num_envs", metavar="N", nargs="+", type=cli.whole(1, COUNT), help=text)
+    text = f"for all rollouts together, without compiling (default: {SECONDS:.0f})"
+    measured.add_argument("--seconds", metavar="S", type=cli.positive("seconds"), default=SECONDS, help=text)
+    text = "remove what was measured for the task, and stop"
+    measured.add_argument("--forget", action="store_true", help=text)
+    computing.add_argument("--device", metavar="NAME", help="auto, cpu, gpu, gpu:1 or cuda:0 (default: auto)")
+    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"
+    computing.add_argument("--cache_dir", metavar="DIR", help=text)
+    parser.group("output").add_argument("--headless", action="store_true", help="plain lines, without colours")
     return parser
 
 

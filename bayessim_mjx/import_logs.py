@@ -24,8 +24,8 @@ FORMATS = {
 
 def _parser() -> cli.PlainParser:
     text = "Check logs, or convert recordings to a folder of CSV files and a map of their columns (docs/logs.md)."
-    prog = cli.prog_of("logs").replace("bayessim_mjx.logs", "bayessim_mjx.import_logs")
-    parser = cli.PlainParser(prog=prog, description=text, usage="%(prog)s FORMAT PATH [PATH ...] [options]")
+    prog = cli.prog_of("logs")
+    parser = cli.PlainParser("logs", description=text, usage="%(prog)s FORMAT PATH [PATH ...] [options]")
     formats = parser.add_subparsers(dest="format", metavar="FORMAT", required=True, prog=prog)
     of = {name: formats.add_parser(name, help=what, description=f"Convert {what}.") for name, what in FORMATS.items()}
     for name, each in of.items():
@@ -139,6 +139,7 @@ def _logs(argv: Sequence[str] | None) -> int:
     if args.format == "check":
         return _checked(args)
     scale, of_commands = _scales(args)
+    cli.writable(args.out, "--out")
     from bayessim_mjx.logs.importers.folder import Target
 
     model = _model(args.model)

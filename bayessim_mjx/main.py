@@ -1,6 +1,6 @@
-"""`python -m bayessim_mjx.main --task Pendulum`: adaptive domain randomisation.
+"""`bayessim-mjx COMMAND`, the console script, and its command `main`: adaptive domain randomisation.
 
-It is also the console script: `bayessim-mjx train --task Ant` is `python -m bayessim_mjx.train --task Ant`.
+`python -m bayessim_mjx.main` is `bayessim-mjx main`, and so for the module of every command.
 """
 
 from __future__ import annotations
@@ -13,32 +13,24 @@ from importlib import import_module
 from typing import Any
 
 from bayessim_mjx import cli
-from bayessim_mjx.cli import completion
+from bayessim_mjx.cli import commands, completion
 from bayessim_mjx.config import Config, to_yaml
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError, unknown
 
+ABOUT = """\
+Policies that hold on the real system: adaptive domain randomisation with
+BayesSim, and diagnosis of the gap between a simulator and recorded motion."""
+AFTER = f"""\
+`{cli.SCRIPT} help COMMAND` shows flags, defaults and examples of a command.
+Documentation: {commands.SITE}"""
 DESCRIPTION = (
     "Adaptive domain randomisation: rounds of PPO training, evaluation, simulation and inference of the physics."
 )
-
-COMMANDS = {  # all of them, and what each is for
-    "main": "adaptive domain randomisation, the command without a name",
-    "train": "PPO alone",
-    "play": "returns, videos and ONNX files of a saved policy",
-    "calibrate": "how far a finished run's posterior can be trusted",
-    "diagnose": "what a simulator is missing, from recorded motion",
-    "blind": "which missing effects a diagnosis would find on your robot",
-    "gap_loop": "what a diagnosis is worth in return",
-    "logs": "checks logs; converts MCAP, ROS bags, LeRobot, HDF5",
-    "implementations": "whether MJX or MuJoCo Warp is faster here, for env.impl=auto",
-    "completion": "a script by which bash, zsh or fish completes commands",
-}
 COMPLETION = (
     'Print a script of completions. bash: eval "$(bayessim-mjx completion bash)" in ~/.bashrc; '
     "fish: bayessim-mjx completion fish | source; zsh: write it to _bayessim-mjx in a folder of $fpath."
 )
-MODULES = {"logs": "import_logs", "blind": "blind_check"}  # of commands that are called otherwise
 
 
 class Watched:
@@ -78,18 +70,13 @@ class Watched:
 
 
 def _parser() -> cli.Parser:
-    parser = cli.Parser("main", DESCRIPTION, resume=True)
-    others = "\n".join(f"{name.replace('_', '-'):16}{text}" for name, text in COMMANDS.items())
-    parser.add_argument_group(f"commands of {cli.SCRIPT}", others)
-    return parser
+    return cli.Parser("main", DESCRIPTION, resume=True)
 
 
 def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
     """(settings, run to go on with or None)."""
-    from bayessim_mjx.runs import Run
-
     if args.resume:
-        run = Run.open(args.resume)
+        run = cli.open_run(args.resume, "--resume")
         if args.max_iterations is not None:
             raise UserError(
                 "--max_iterations: all rounds of a run have the same number, also those that are done; to train longer "
@@ -101,12 +88,14 @@ def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
     config = cli.pin_policy(cli.config_of(args, more))
     if config.ppo.teacher is not None:
         raise UserError(
-            f"ppo.teacher = {config.ppo.teacher!r}: main has no use for it; bayessim_mjx.train --distil has"
+            f"ppo.teacher = {config.ppo.teacher!r}: main has no use for it; use bayessim-mjx train --distil RUN"
         )
     if config.domain is not None:
-        raise UserError(f"domain = {config.domain!r}: main draws from its own posterior; train --domain has this")
+        raise UserError(
+            f"domain = {config.domain!r}: main draws from its own posterior; use bayessim-mjx train --domain"
+        )
     if config.agent != "own":
-        raise UserError(f"agent = {config.agent!r}: main has our own PPO alone; train --agent has others")
+        raise UserError(f"agent = {config.agent!r}: main has our own PPO alone; use bayessim-mjx train --agent")
     return config, None
 
 
@@ -131,7 +120,7 @@ def _run(config: Config, run: Any, device: Any, command: Sequence[str], console:
             state = _rounds(parts, state, run, console, resumed_at)
         _report(console, parts, state)
     which = "best" if run.manifest["best"] is not None else "latest"
-    console.command(f"{which} policy", f"python -m bayessim_mjx.play --checkpoint {run.path} --video")
+    console.command(f"{which} policy", f"{cli.prog_of('play')} --checkpoint {run.path} --video")
     console.command("pictures", f"tensorboard --logdir {run.path} --samples_per_plugin images=1000")
     return 0
 
@@ -193,46 +182,71 @@ def _adapt(argv: Sequence[str] | None) -> int:
         return cli.list_tasks()
     config, run = _prepare(args)
     if config.randomization.get("randomize") is False and config.bayessim.modelClass is not None:
-        raise UserError("task.randomize = False: there is nothing to infer; use bayessim_mjx.train for PPO alone")
+        raise UserError("task.randomize = False: there is nothing to infer; use bayessim-mjx train for PPO alone")
+    if run is None:
+        cli.writable(config.logdir, "--logdir")
     from bayessim_mjx.monitor.console import Console
 
     device = setup_jax(config)
     with cli.first_writes(config, run) as (config, run), Console(headless=args.headless) as console:
-        return _run(config, run, device, ["python", "-m", "bayessim_mjx.main", *argv], console)
+        return _run(config, run, device, [cli.SCRIPT, "main", *argv], console)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """`bayessim-mjx`: the command that the first word names; without one the outer loop."""
+    """`bayessim-mjx`: the command that the first word names; flags or settings without a command are those of main."""
     argv = list(sys.argv[1:] if argv is None else argv)
-    first = argv[0] if argv else ""
-    if first.startswith("-") or "=" in first or not first:
-        return cli.command(_adapt)(argv)
-    return cli.command(_named)(argv)
-
-
-def _module(command: str) -> Any:
-    return import_module(f"bayessim_mjx.{MODULES.get(command, command)}")
+    first = argv[0] if argv else "--help"
+    if first in ("-h", "--help"):
+        return cli.command(_help)([])
+    adapts = first.startswith("-") or "=" in first
+    return cli.command(_adapt if adapts else _named)(argv)
 
 
 def _named(argv: Sequence[str] | None) -> int:
     """The command that the first word names, with a hyphen or an underscore."""
-    name, *rest = argv or ()
-    command = name.replace("-", "_")
-    if command not in COMMANDS:
-        raise unknown("command", name, [c.replace("_", "-") for c in COMMANDS])
-    own = {"main": _adapt, "completion": _completion}
-    return own[command](rest) if command in own else _module(command).main(rest)
+    written, *rest = argv or ()
+    name = commands.name_of(written)
+    if name not in commands.COMMANDS:
+        raise unknown("command", written, commands.COMMANDS)
+    own = {"main": _adapt, "completion": _completion, "help": _help}
+    return own[name](rest) if name in own else _module(name).main(rest)
+
+
+def _module(name: str) -> Any:
+    return import_module(f"bayessim_mjx.{commands.module_of(name)}")
+
+
+def _help_parser() -> cli.PlainParser:
+    about = "Show the help of a command, or the list of all commands."
+    parser = cli.PlainParser("help", description=about, usage="%(prog)s [COMMAND]")
+    parser.add_argument("words", metavar="COMMAND", nargs="*", help="a command, and its part where it has parts")
+    return parser
+
+
+def _help(argv: Sequence[str] | None) -> int:
+    """Print the help of a command, or all commands in their groups; exit code 0, or 2 (no such command)."""
+    words = _help_parser().parse_args(argv).words
+    if words:
+        return _named([*words, "--help"])
+    text = f"{ABOUT}\n\n{commands.overview()}"
+    cli.PlainParser(prog=cli.SCRIPT, description=text, usage="%(prog)s COMMAND [options]", epilog=AFTER).print_help()
+    return 0
+
+
+def _completion_parser() -> cli.PlainParser:
+    parser = cli.PlainParser("completion", description=COMPLETION, usage="%(prog)s SHELL")
+    parser.add_argument("shell", choices=completion.SHELLS, help="whose script")
+    return parser
 
 
 def _completion(argv: Sequence[str] | None) -> int:
     """Print the script for a shell; exit code 0, or 2 (another shell, or shtab is not installed)."""
-    parser = cli.PlainParser(prog=f"{cli.SCRIPT} completion", description=COMPLETION, usage="%(prog)s SHELL")
-    parser.add_argument("shell", choices=completion.SHELLS, help="whose script")
-    shell, parsers = parser.parse_args(argv).shell, {"main": _parser(), "completion": parser}
-    of = {name: parsers.get(name) or _module(name)._parser() for name in COMMANDS}
-    print(completion.script(shell, {name.replace("_", "-"): (COMMANDS[name], of[name]) for name in of}))
+    parser = _completion_parser()
+    shell, own = parser.parse_args(argv).shell, {"main": _parser(), "completion": parser, "help": _help_parser()}
+    of = {name: own.get(name) or _module(name)._parser() for name in commands.COMMANDS}
+    print(completion.script(shell, {name: (commands.COMMANDS[name].about, of[name]) for name in of}))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(["main", *sys.argv[1:]]))

@@ -1,4 +1,4 @@
-"""`python -m bayessim_mjx.play --task Pendulum --checkpoint best --video`: returns of a saved policy, and a video.
+"""`bayessim-mjx play --task Pendulum --checkpoint best --video`: returns of a saved policy, and a video.
 
 `--export` writes the policy as an ONNX file instead, `--hub` a folder for a model hub.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,32 +31,22 @@ KINDS = {
 def _parser() -> cli.Parser:
     without = ("--num_envs", "--max_iterations", "--video_interval", "--logger", "--name", "--resume")
     parser = cli.Parser("play", DESCRIPTION, without=without)
-    parser.add_argument(
+    tests, files = parser.group("evaluation"), parser.group("output")
+    tests.add_argument(
         "--episodes",
         metavar="N",
         type=cli.whole(1, COUNT),
         help="episodes for each kind of physics (default: --num_envs, else bayessim.realEvals)",
     )
     # Isaac Lab's; not the setting env.numEnvs, which training's batches are limited by
-    parser.add_argument("--num_envs", metavar="N", type=cli.whole(0, COUNT), dest="worlds", help="same as --episodes")
-    parser.add_argument(
-        "--use_pretrained_checkpoint",
-        action="store_true",
-        help="play the policy of the task that comes with the package (docs/pretrained.md)",
-    )
-    parser.add_argument("--physics", choices=KINDS, help="evaluate on this kind of physics only")
-    parser.add_argument(
-        "--export",
-        metavar="FILE",
-        nargs="?",
-        const="",
-        help="write the policy as an ONNX file and stop (default: in exported/ of the run)",
-    )
-    parser.add_argument(
-        "--hub",
-        metavar="FOLDER",
-        help="write a folder for a model hub: ONNX file, settings, and a card with the returns",
-    )
+    tests.add_argument("--num_envs", metavar="N", type=cli.whole(0, COUNT), dest="worlds", help="same as --episodes")
+    tests.add_argument("--physics", choices=KINDS, help="evaluate on this kind of physics only (default: all)")
+    text = "play the policy of the task that comes with the package (docs/pretrained.md)"
+    parser.group("training").add_argument("--use_pretrained_checkpoint", action="store_true", help=text)
+    text = "write the policy as an ONNX file and stop (default: in exported/ of the run)"
+    files.add_argument("--export", metavar="FILE", nargs="?", const="", help=text)
+    text = "write a folder for a model hub: ONNX file, settings, and a card with the returns"
+    files.add_argument("--hub", metavar="FOLDER", help=text)
     return parser
 
 
@@ -105,21 +95,21 @@ def _nominal(env: Any, count: int) -> Any:
     return jnp.tile(jnp.asarray(env.space.nominal, jnp.float32), (count, 1))
 
 
-def _physics(config: Config, env: Any, checkpoint: Path | None, key: Any, count: int) -> dict[str, Any]:
-    """theta [count, d] of every kind of physics that there is; a posterior comes with a `checkpoint`."""
+def _physics(config: Config, env: Any, checkpoint: Path | None, key: Any, count: int) -> dict[str, Callable[[], Any]]:
+    """Functions that draw theta [count, d] of every kind of physics; a posterior comes with a `checkpoint`."""
     from bayessim_mjx.distributions import Distribution
     from bayessim_mjx.loop.sources import make_source
     from bayessim_mjx.wrappers.worlds import posterior_of
 
-    kinds = {"nominal": _nominal(env, count)}
+    kinds: dict[str, Callable[[], Any]] = {"nominal": lambda: _nominal(env, count)}
     if not len(env.space):
         return kinds
     prior = Distribution.prior(env.space, config.bayessim.components)
-    kinds["prior"] = prior.sample(key, count)
+    kinds["prior"] = lambda: prior.sample(key, count)
     if config.env.realParams is not None and not config.real.logs:
-        kinds["real"] = make_source(config, env).sample(key, count)  # type: ignore[union-attr]
+        kinds["real"] = lambda: make_source(config, env).sample(key, count)  # type: ignore[union-attr]
     if checkpoint is not None and (domain := posterior_of(env, checkpoint, config)) is not None:
-        kinds["posterior"] = domain.sample(key, count)
+        kinds["posterior"] = lambda: domain.sample(key, count)
     return kinds
 
 
@@ -146,8 +136,6 @@ def _export(env: Any, policy: Any, checkpoint: Path, run: Any, target: str) -> s
     """Write the ONNX file; what to say of it."""
     from bayessim_mjx.rl import export
 
-    if target and not target.endswith(".onnx"):
-        raise UserError(f"--export {target}: the file's name has to end with .onnx")
     folder = (run.path if run is not None else checkpoint.parent) / "exported"
     path = Path(target) if target else folder / f"{checkpoint.name}.onnx"
     error = export.write(path, policy, env, {"checkpoint": checkpoint.name})
@@ -173,6 +161,12 @@ def _play(argv: Sequence[str] | None) -> int:
         return cli.list_tasks()
     if args.hub and args.export is not None:
         raise UserError("--hub and --export: give one of them; --hub writes the ONNX file too")
+    if args.hub:
+        cli.writable(args.hub, "--hub")
+    if args.export:
+        if not args.export.endswith(".onnx"):
+            raise UserError(f"--export {args.export}: the file's name has to end with .onnx")
+        cli.writable(Path(args.export).parent, "--export")
     config, path, run = _settings(args)
     count = args.episodes or args.worlds or config.bayessim.realEvals
     from bayessim_mjx.monitor.console import Console
@@ -222,12 +216,12 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     kinds = _physics(config, env, None if args.use_pretrained_checkpoint else path, key, count)
     if trained.randomization.get("randomize") is False and getattr(env, "nuisance", None):
         plain = _acted_in(trained, run)  # nominal physics is then without the noise that comes with randomisation
-        kinds["nominal"] = _nominal(plain, count)
+        kinds["nominal"] = lambda: _nominal(plain, count)
     if args.physics and args.physics not in kinds:
         raise UserError(f"--physics {args.physics}: this checkpoint and task have {', '.join(kinds)}")
     whose = "the policy that comes with the package" if args.use_pretrained_checkpoint else f"checkpoint {path}"
     console.say(f"{config.task}, {count} episodes each, {whose}")
-    chosen, rows = {args.physics: kinds[args.physics]} if args.physics else kinds, []
+    chosen, rows = {name: kinds[name]() for name in kinds if args.physics in (None, name)}, []
     returns = {}
     for name, thetas in chosen.items():
         result = rl.evaluate(plain if name == "nominal" else env, policy, branch(key, 1), thetas)

@@ -1,4 +1,4 @@
-"""`python -m bayessim_mjx.train --task Ant`: PPO alone, on nominal physics, the prior or (`--domain RUN`) a posterior.
+"""`bayessim-mjx train --task Ant`: PPO alone, on nominal physics, the prior or (`--domain RUN`) a posterior.
 
 `--distil RUN` trains a student of that run's policy instead.
 """
@@ -20,7 +20,6 @@ from bayessim_mjx.quantities import estimate
 DESCRIPTION = "Train a policy with PPO alone, on nominal physics or on physics drawn from the prior or a posterior."
 
 SPEED, WORTH_SAYING = "Perf/total_fps", 0.5  # seconds of compilation
-PLAY = "python -m bayessim_mjx.play"
 SHOWN = (
     "Train/mean_reward",
     "Train/mean_episode_length",
@@ -34,12 +33,13 @@ SHOWN = (
 
 def _parser() -> cli.Parser:
     parser = cli.Parser("train", DESCRIPTION, resume=True, unused=("bayessim", "real"), but=("bayessim.policyCheckpt",))
-    parser.add_argument("--randomize", action="store_true", help="draw the physics of each episode from the prior")
+    physics, learner = parser.group("physics"), parser.group("training")
+    physics.add_argument("--randomize", action="store_true", help="draw the physics of each episode from the prior")
     about = "draw it from the posterior of this run, with its settings; or nominal, prior, a file of Distribution.save"
-    parser.add_argument("--domain", metavar="RUN", help=about)
+    physics.add_argument("--domain", metavar="RUN", help=f"{about} (default: nominal)")
     about = "train a student that imitates the policy of this run or checkpoint, instead of PPO"
-    parser.add_argument("--distil", metavar="RUN", help=about)
-    parser.add_argument("--agent", choices=AGENTS, help="whose PPO trains (default: own; docs/trainers.md)")
+    learner.add_argument("--distil", metavar="RUN", help=about)
+    learner.add_argument("--agent", choices=AGENTS, help="whose PPO trains (default: own; docs/trainers.md)")
     return parser
 
 
@@ -267,7 +267,7 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
                 finally:
                     training.close()
         which = "latest" if run.manifest["best"] is None else f"best (step {run.manifest['best']})"
-        console.command(f"{which} policy", f"{PLAY} --checkpoint {run.path} --video")
+        console.command(f"{which} policy", f"{cli.prog_of('play')} --checkpoint {run.path} --video")
         console.command("curves", f"tensorboard --logdir {run.path}")
     return 0
 
@@ -277,11 +277,9 @@ def _train(argv: Sequence[str] | None) -> int:
     args = _parser().parse(argv)
     if args.list_tasks:
         return cli.list_tasks()
-    from bayessim_mjx.runs import Run
-
-    command = ["python", "-m", "bayessim_mjx.train", *argv]
+    command = [cli.SCRIPT, "train", *argv]
     if args.resume:
-        run = Run.open(args.resume)
+        run = cli.open_run(args.resume, "--resume")
         return _run(cli.prolonged_config(args, run), run, command, args.headless)
     more = cli.physics_settings(args)
     if args.agent:
@@ -290,7 +288,9 @@ def _train(argv: Sequence[str] | None) -> int:
         more["--distil"] = ("ppo.teacher", str(cli.find_checkpoint(args.distil, None, "")[0]))
     if args.checkpoint:
         more["--checkpoint"] = ("bayessim.policyCheckpt", args.checkpoint)
-    return _run(cli.pin_policy(cli.config_of(args, more)), None, command, args.headless)
+    config = cli.pin_policy(cli.config_of(args, more))
+    cli.writable(config.logdir, "--logdir")
+    return _run(config, None, command, args.headless)
 
 
 main = cli.command(_train)

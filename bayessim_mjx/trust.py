@@ -3,9 +3,12 @@
 Settings files, run folders, effects.yaml and diagnosis.json may come from anybody; see docs/trust.md.
 """
 
+import functools
 import os
+import sys
 from collections.abc import Iterable
 from pathlib import Path
+from types import ModuleType
 
 from bayessim_mjx.errors import UserError
 
@@ -18,10 +21,53 @@ def allow(files: Iterable[str | os.PathLike]) -> None:
     _named.update(Path(file).expanduser().resolve() for file in files)
 
 
-def check(file: Path, spec: str) -> None:
-    """UserError where the user has not named `file`, which a settings file asks for as `spec`."""
+def check(file: Path, spec: str, what: str = "effect") -> None:
+    """UserError where the user has not named `file`, which a settings file asks for as the `what` called `spec`."""
     if file.resolve() not in _named:
         raise UserError(
-            f"effect {spec!r}: settings name code of yours, which runs only where you name it too; read {file}, then "
+            f"{what} {spec!r}: settings name code of yours, which runs only where you name it too; read {file}, then "
             f"give {FLAG} {file} (docs/trust.md)"
         )
+
+
+def module_of(path: Path, title: str, what: str, package: str) -> ModuleType:
+    """The module that a user's file makes; one for each file as it is now, so that equal classes are equal.
+
+    Args:
+        path: the file; title: the class that is wanted of it, for messages; what: "effect", "task".
+        package: the module's name is `<package>.own_<file>_<digest>`.
+
+    Raises:
+        UserError: no such file, the user has not named it, or it fails, then with its line.
+    """
+    if not path.is_file():
+        raise UserError(f"{what} {path}:{title}: no file {path} (from {Path.cwd()})")
+    check(path, f"{path}:{title}", what)
+    path = path.resolve()
+    return _executed(path, path.stat().st_mtime_ns, package)
+
+
+@functools.cache
+def _executed(path: Path, changed: int, package: str) -> ModuleType:
+    import hashlib  # here, so that commands start fast
+    import importlib.util
+
+    name = f"{package}.own_{path.stem}_{hashlib.sha1(f'{path}{changed}'.encode()).hexdigest()[:8]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        del sys.modules[name]
+        raise UserError(f"{path}{line_of(error, path)}: {type(error).__name__}: {error}") from error
+    return module
+
+
+def line_of(error: BaseException, path: Path) -> str:
+    """Where in the user's file it went wrong, as ", line 3"; empty where the file has no part in it."""
+    import traceback
+
+    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
+    line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
+    return f", line {line}" if line else ""

@@ -2,7 +2,7 @@
 
     python examples/adapt_servo.py [--out DIR] [--seed N] [section.key=value ...]
 
-The same as `python -m bayessim_mjx.main --task ServoPendulum real.logs=DIR` with a small budget, and with the gap (how
+The same as `bayessim-mjx main --task ServoPendulum real.logs=DIR` with a small budget, and with the gap (how
 far replayed motion is from the logs) before and after. The published fits are BAM's files params/xl330_HEAD_m*.json.
 """
 

@@ -1,8 +1,8 @@
 """Run an exported policy at its control rate on a stand-in for a robot, with safety stops, and write its logs.
 
-python -m bayessim_mjx.play --task Pendulum --checkpoint best --export policy.onnx
+bayessim-mjx play --task Pendulum --checkpoint best --export policy.onnx
 python examples/deploy_loop.py --policy policy.onnx --seconds 20 --spread 3 --noise 0.001 --out logs/robot
-python -m bayessim_mjx.diagnose --task Pendulum --data logs/robot
+bayessim-mjx diagnose --task Pendulum --data logs/robot
 
 The policy needs numpy and onnxruntime alone. The stand-in is MuJoCo on the CPU: for your own robot replace `Robot`.
 """

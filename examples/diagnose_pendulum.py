@@ -85,7 +85,8 @@ def main() -> None:
     policy, _ = rl.train(plain, settings.ppo, jax.random.PRNGKey(0), iterations=settings.ppo.max_iterations)
     before, after = returns(plain, policy), returns(corrected, policy)
     print(f"a policy of the plain simulator: it predicts a return of {before:.0f}, the corrected one {after:.0f}")
-    print(f"what retraining recovers: python -m bayessim_mjx.gap_loop --task Pendulum --diagnosis {out / 'found'} ...")
+    command = f"bayessim-mjx gap-loop --task Pendulum --diagnosis {out / 'found'} --real {out / 'logs'}"
+    print(f"what retraining recovers: {command}")
 
 
 if __name__ == "__main__":

@@ -109,7 +109,7 @@ def test_under_braxs_training_wrapper(cartpole):
 
 
 def test_unknown_names_and_settings_are_refused_with_a_hint():
-    with pytest.raises(UserError, match="did you mean Cartpole"):
+    with pytest.raises(UserError, match="Did you mean Cartpole"):
         registry.make("cartpol")
     with pytest.raises(UserError, match="env.resetDits.*did you mean resetDist"):
         registry.make("Cartpole", resetDits=2.0)

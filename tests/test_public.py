@@ -54,6 +54,16 @@ def test_the_lock_file_has_what_the_package_asks_for():
     assert own["version"] == project["version"]
 
 
+def test_the_command_that_the_end_of_a_run_suggests_is_installed_by_default():
+    root = Path(__file__).parents[1]
+    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    sources = [*(root / "bayessim_mjx").glob("*.py"), *(root / "bayessim_mjx/cli").glob("*.py")]
+    texts = "".join(file.read_text(encoding="utf-8") for file in sources)
+    suggested = re.findall(r"console\.command\([^,]*, f\"(\S+) ", texts)
+    suggested = {word for word in suggested if word != "{cli.prog_of('play')}"}
+    assert suggested == {"tensorboard"} and "tensorboard" in {_asked(text)[0] for text in project["dependencies"]}
+
+
 def _asked(text, extra=""):
     """(name, extras, limits, extra of ours) of a requirement; limits as uv writes them, the lower one first."""
     name, extras, limits = re.match(r"([\w.-]+)(?:\[(.*)\])?(.*)", text).groups()

@@ -60,7 +60,7 @@ class Check:
     def __post_init__(self) -> None:
         for name in self.effects:
             if name not in KNOWN:
-                raise unknown("effect", name, sorted(KNOWN))
+                raise unknown("--effects:", name, sorted(KNOWN), "docs/effects.md")
 
     @property
     def asked(self) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx import atomic
+from bayessim_mjx import atomic, trust
 from bayessim_mjx.blind.cases import ITEM, Item, again, make
 from bayessim_mjx.blind.check import Check, bench, loader
 from bayessim_mjx.blind.process import STOPPED, run
@@ -23,6 +23,7 @@ from bayessim_mjx.blind.reality.menu import KNOWN
 from bayessim_mjx.blind.reality.plant import Plant
 from bayessim_mjx.blind.reality.twin import base_of, closed, twins
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.outside_tasks import is_file
 
 TIMEOUT = 3600.0  # s per diagnosis, against one that hangs
 KEPT = ("diagnosis.json", "answer.json")
@@ -107,6 +108,8 @@ def main() -> int:
     first = json.loads(sys.stdin.readline())
     given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in first.items()}
     check, answers = Check(**given), os.fdopen(os.dup(1), "w")
+    if is_file(check.task):  # the user named it to the command that started this process
+        trust.allow([check.task.rpartition(":")[0]])
     os.dup2(2, 1)  # whatever prints must not answer
     for line in sys.stdin:
         try:

@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Mapping
 
-from bayessim_mjx.cli.flags import SCRIPT
+from bayessim_mjx.cli.commands import SCRIPT
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.task_names import names
 

@@ -1,49 +1,17 @@
-"""Flags of the commands, and `section.key=value` overrides. No jax before parsing."""
+"""Flags that set settings, and `section.key=value` overrides. No jax before parsing."""
 
 import argparse
-import re
+import dataclasses
 import sys
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, NoReturn
+from collections.abc import Sequence
+from typing import Any
 
 from bayessim_mjx import trust
-from bayessim_mjx.cli import ancestors
-from bayessim_mjx.config.settings import WRITERS
-from bayessim_mjx.errors import UserError, unknown
-
-SCRIPT = "bayessim-mjx"  # the console script, and the name of the package as it is installed
-
-
-def whole(low: int, high: int) -> Callable[[str], int]:
-    """The type of a flag that takes a whole number from `low` to `high`, in the digits 0 to 9."""
-
-    def number(text: str) -> int:
-        if not re.fullmatch("[+-]?[0-9]{1,25}", text):
-            raise argparse.ArgumentTypeError(f"invalid int value: {text[:60]!r}")
-        if not low <= int(text) <= high:
-            raise argparse.ArgumentTypeError(f"{text}: must be from {low} to {high}")
-        return int(text)
-
-    return number
-
-
-def positive(unit: str) -> Callable[[str], float]:
-    """The type of a flag that takes a number of `unit` (a plural), more than 0 and below 1e5."""
-
-    def number(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = 0.0
-        if not 0 < value < 1e5:
-            raise argparse.ArgumentTypeError(f"{text!r}: allowed: {unit}, more than 0")
-        return value
-
-    return number
-
-
-integer = whole(-(10**25), 10**25)  # where the settings know the limits
+from bayessim_mjx.cli import ancestors, commands
+from bayessim_mjx.cli.parsers import PlainParser, integer, task
+from bayessim_mjx.config.layers import SECTIONS
+from bayessim_mjx.config.settings import WRITERS, Config
+from bayessim_mjx.errors import UserError
 
 
 def _writers(text: str) -> tuple[str, ...]:
@@ -56,24 +24,35 @@ def _writers(text: str) -> tuple[str, ...]:
 # flag -> (dotted key, type, help); None as type: a switch
 FLAGS: dict[str, tuple[str, Any, str]] = {
     "--num_envs": ("env.numEnvs", integer, "number of simulated worlds in parallel; 0: the settings'"),
-    "--episode_length": ("env.episodeLength", integer, "control steps of an episode; 0: the task's own"),
+    "--episode_length": ("env.episodeLength", integer, "control steps of an episode; 0: the settings'"),
     "--seed": ("seed", integer, "random seed; -1 draws one"),
-    "--max_iterations": ("ppo.max_iterations", integer, "PPO iterations in all; in main the number per round"),
+    "--max_iterations": ("ppo.max_iterations", integer, "PPO iterations"),
     "--video": ("monitor.video", None, "record videos"),
     "--video_length": ("monitor.video_length", integer, "length of a video in control steps"),
     "--video_interval": ("monitor.video_interval", integer, "control steps of each world from one video to the next"),
     "--logger": ("monitor.writers", _writers, "where figures go beside TensorBoard: wandb, jsonl or csv"),
-    "--logdir": ("logdir", str, "folder of all runs (default: logs)"),
+    "--logdir": ("logdir", str, "folder of all runs"),
     "--name": ("name", str, "word added to the name of the run folder"),
-    "--device": ("device", str, "auto, cpu, gpu, gpu:1 or cuda:0 (default: auto)"),
+    "--device": ("device", str, "auto, cpu, gpu, gpu:1 or cuda:0"),
     "--devices": ("devices", str, "number of devices that share the worlds, or all"),
     "--cache_dir": ("cache_dir", str, "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"),
 }
-ALSO_KEYS = {key for key, _, _ in FLAGS.values()} | {"agent"}  # flags that are settings of the same name, too
-CHECKPOINTS = {
-    "play": "policy to play (default: best)",
-    "gap_loop": "policies to evaluate in place of training new ones on the simulator as it was",
+TASK, TRAINING, OUTPUT, COMPUTING = "task and settings", "training", "output", "computing"
+ORDER = (TASK, "diagnosis", "real system", "physics", TRAINING, "evaluation", OUTPUT, COMPUTING)  # of headings
+HEADINGS = {
+    TASK: ("--num_envs", "--episode_length", "--seed"),
+    TRAINING: ("--max_iterations",),
+    OUTPUT: ("--logdir", "--name", "--logger", "--video", "--video_length", "--video_interval"),
+    COMPUTING: ("--device", "--devices", "--cache_dir"),
 }
+SAID = {  # what a flag means in one command, where that differs
+    ("main", "--max_iterations"): "PPO iterations of each round",
+    ("train", "--max_iterations"): "PPO iterations in all",
+    ("play", "--checkpoint"): "policy to play (default: best)",
+    ("gap-loop", "--checkpoint"): "policies to evaluate in place of training new ones on the simulator as it was",
+    ("train", "--resume"): "continue an interrupted run; with --max_iterations also a finished one",
+}
+ALSO_KEYS = {key for key, _, _ in FLAGS.values()} | {"agent"}  # flags that are settings of the same name, too
 METAVARS = {str: "TEXT", integer: "N"} | {
     "--devices": "N|all",
     "--logger": "WRITER",
@@ -89,58 +68,14 @@ RESUMABLE = (
 )  # fmt: skip
 
 
-def prog_of(command: str) -> str:
-    """How `command` was started, for its usage line: by the console script or as a module."""
-    script = Path(sys.argv[0]).stem == SCRIPT
-    return f"{SCRIPT} {command.replace('_', '-')}" if script else f"python -m bayessim_mjx.{command}"
-
-
-class Lines(argparse.HelpFormatter):
-    """Texts of several lines, as tables, keep them."""
-
-    def _fill_text(self, text: str, width: int, indent: str) -> str:
-        if "\n" in text:
-            return "\n".join(indent + line for line in text.splitlines())
-        return super()._fill_text(text, width, indent)
-
-
-class PlainParser(argparse.ArgumentParser):
-    """Flags; what is wrong with them is a UserError. The usage line does not repeat the list of options."""
-
-    def __init__(self, **options: Any):
-        plain: dict[str, Any] = {"usage": "%(prog)s [options]", "allow_abbrev": False, "formatter_class": Lines}
-        super().__init__(**(plain | options))
-        self.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
-
-    def trusting(self) -> None:
-        """Add the flag that lets code run which settings name."""
-        text = "allow settings to use effects from this Python file; repeat for more files (docs/trust.md)"
-        self.add_argument(trust.FLAG, metavar="FILE", action=Allow, default=[], help=text)
-
-    def error(self, message: str) -> NoReturn:
-        raise UserError(message.removeprefix("argument "))
-
-
-class Version(argparse.Action):
-    """Prints the version of this package, and those of what decides its results, and stops."""
-
-    def __call__(self, parser: Any, *_: Any, **__: Any) -> None:
-        from bayessim_mjx.versions import versions
-
-        found = versions()
-        others = ", ".join(f"{name} {found[name]}" for name in ("python", "jax", "mujoco") if name in found)
-        print(f"{SCRIPT} {found.get(SCRIPT, 'not installed')} ({others})")
-        parser.exit()
-
-
-class Allow(argparse.Action):
-    """Takes a file of code and allows it."""
-
-    def __call__(self, parser: Any, namespace: Any, value: Any, option: str | None = None) -> None:
-        if not Path(value).is_file():
-            raise UserError(f"{option} {value}: no such file; give the Python file that is to run")
-        trust.allow([value])
-        setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
+def default_of(key: str) -> str:
+    """The default of a setting as a help shows it; empty where there is none to show."""
+    section, _, name = key.rpartition(".")
+    if section in ("env", "ppo"):
+        return " (default: the task's)"
+    kind: Any = SECTIONS[section] if section else Config
+    value = next(f.default for f in dataclasses.fields(kind) if f.name == name)
+    return "" if value is None or value is False or value in ("", ()) else f" (default: {value})"
 
 
 class Parser(PlainParser):
@@ -148,7 +83,7 @@ class Parser(PlainParser):
 
     def __init__(
         self,
-        prog: str,
+        command: str,
         description: str,
         resume: bool = False,
         without: Sequence[str] = (),
@@ -156,33 +91,48 @@ class Parser(PlainParser):
         but: Sequence[str] = (),
     ):
         """`without`: flags, and `unused`: sections of settings (`but` these keys), that the command does not take."""
-        usage = "%(prog)s [options] [section.key=value ...]"
-        super().__init__(prog=prog_of(prog), description=description, usage=usage)
-        self.command, self.without, self.unused, self.but = prog, without, unused, but
-        self.add_argument("--task", metavar="NAME", help="name of the task; --list_tasks prints them")
-        for flag, (_, kind, text) in FLAGS.items():
-            if flag in without:
-                continue
-            shown = METAVARS.get(flag, METAVARS.get(kind))
-            options: dict[str, Any] = {"action": "store_true"} if kind is None else {"type": kind, "metavar": shown}
-            self.add_argument(flag, default=None, help=text, **options)
+        super().__init__(command, description=description, usage="%(prog)s [options] [section.key=value ...]")
+        self.command, self.without, self.unused, self.but = commands.name_of(command), without, unused, but
+        for heading in ORDER:  # one without flags is not shown
+            self.group(heading)
+        group = self.group(TASK)
+        text = "name of a task, or file.py:Class; --list_tasks prints names"
+        group.add_argument("--task", metavar="TASK", type=task, help=text)
+        group.add_argument("--cfg_env", metavar="FILE", help="YAML file with settings, read after cfg/<task>.yaml")
+        group.add_argument("--cfg_train", metavar="FILE", help="YAML file with PPO settings, ours or rl-pytorch's")
+        for heading, flags in HEADINGS.items():
+            for flag in flags:
+                self._setting(heading, flag)
         for flag, ours in ancestors.SAME.items():
             if ours not in without:
                 self.add_argument(flag, help=argparse.SUPPRESS)
-        self.trusting()
-        self.add_argument("--cfg_env", metavar="FILE", help="YAML file with settings, read after cfg/<task>.yaml")
-        self.add_argument("--cfg_train", metavar="FILE", help="YAML file with PPO settings, ours or rl-pytorch's")
-        self.add_argument(
-            "--checkpoint", metavar="PATH|latest|best", help=CHECKPOINTS.get(prog, "policy to start from")
-        )
-        self.add_argument("--use_last_checkpoint", action="store_true", help="same as --checkpoint latest")
-        self.add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
-        self.add_argument("--list_tasks", action="store_true", help="print the names of the tasks and stop")
-        if resume:
-            more = "; with --max_iterations also a finished one" if prog == "train" else ""
-            self.add_argument("--resume", metavar="RUN", help=f"continue an interrupted run{more}")
+        self.trusting(TASK)
+        self._start(resume)
+        self.group(OUTPUT).add_argument("--headless", action="store_true", help="plain lines instead of progress bars")
+        group.add_argument("--list_tasks", action="store_true", help="print the names of the tasks and stop")
         example = "ppo.gamma=0.95" if "bayessim" in unused else "bayessim.components=5"
-        self.epilog = f"section.key=value changes any setting, for example {example} (see cfg/*.yaml)"
+        self.epilog = f"{self.epilog or ''}\n\nsection.key=value changes any setting: {example} (docs/commands.md)"
+
+    def _setting(self, heading: str, flag: str) -> None:
+        """Add a flag that sets a setting."""
+        if flag in self.without:
+            return
+        key, kind, text = FLAGS[flag]
+        shown = METAVARS.get(flag, METAVARS.get(kind))
+        options: dict[str, Any] = {"action": "store_true"} if kind is None else {"type": kind, "metavar": shown}
+        text = SAID.get((self.command, flag), text)
+        text += "" if "(default" in text else default_of(key)
+        self.group(heading).add_argument(flag, default=None, help=text, **options)
+
+    def _start(self, resume: bool) -> None:
+        """Add the flags that say which policy or run a command begins with."""
+        group = self.group(TRAINING)
+        text = SAID.get((self.command, "--checkpoint"), "policy to start from")
+        group.add_argument("--checkpoint", metavar="PATH|latest|best", help=text)
+        group.add_argument("--use_last_checkpoint", action="store_true", help="same as --checkpoint latest")
+        if resume:
+            text = SAID.get((self.command, "--resume"), "continue an interrupted run")
+            group.add_argument("--resume", metavar="RUN", help=text)
 
     def parse(self, argv: Sequence[str] | None) -> argparse.Namespace:
         """Namespace with the flags, `overrides`, and `given` (flags that were used)."""
@@ -209,13 +159,15 @@ class Parser(PlainParser):
         """UserError for what is neither one of this command's flags nor an override."""
         flag = text.split("=")[0]
         if ancestors.SAME.get(flag, flag) in self.without:
-            raise UserError(f"{flag}: {self.command} has no use for it")
+            raise UserError(f"{flag}: {self.command} has no use for it; leave it out ({self.prog} --help lists all)")
         if flag.startswith("--") and (said := ancestors.word(flag)):
             raise UserError(f"{flag}: {said}")
         if text.startswith("-"):
-            raise unknown("flag", flag, sorted(self._option_string_actions))
+            raise self.unknown_flag(flag, self._option_string_actions)
+        if commands.name_of(text) in commands.COMMANDS:
+            raise UserError(f"{text!r} is a command of its own: {commands.prog_of(text)}")
         if "=" not in text:
-            raise UserError(f"{text!r} is neither a flag nor an override section.key=value")
+            raise self.refusal(UserError(f"{text!r} is neither a flag nor an override section.key=value"))
         self._refuse_flag_as_key(text)
 
     def _refuse_flag_as_key(self, text: str) -> None:

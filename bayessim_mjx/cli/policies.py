@@ -25,8 +25,11 @@ def find_checkpoint(which: str, task: str | None, logdir: str) -> tuple[Path, "R
     if (path / MANIFEST).is_file():
         run = Run.open(path)
         return run.checkpoint("latest" if run.manifest["best"] is None else "best"), run
+    allowed = "give a run, one of its checkpoints, latest or best"
     if not path.is_dir():
-        raise UserError(f"--checkpoint {which}: no such folder; give a run, one of its checkpoints, latest or best")
+        raise UserError(f"--checkpoint {which}: no such folder; {allowed}")
+    if not (path / checkpoints.INDEX).is_file():
+        raise UserError(f"--checkpoint {which}: neither a run nor a checkpoint (no {MANIFEST} in it); {allowed}")
     checkpoints.read_index(path)
     parents = path.absolute().parents
     return path, Run.open(parents[1]) if (parents[1] / MANIFEST).is_file() else None

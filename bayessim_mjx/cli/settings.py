@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from bayessim_mjx.cli.flags import FLAGS, RESUMABLE, ZERO_IS_NONE
 from bayessim_mjx.config import Config, load, replace
-from bayessim_mjx.errors import UserError, unknown
+from bayessim_mjx.errors import UserError
 
 if TYPE_CHECKING:
     from bayessim_mjx.runs import Run
@@ -30,7 +30,7 @@ def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | No
         print(f"note: {warning.message}", file=sys.stderr)
     task_name(settings.task)
     if args.idle:
-        raise UserError(f"{args.idle[0]}: {args.command} has no use for it")
+        raise UserError(f"{args.idle[0]}: {args.command} has no use for it; leave it out")
     return settings
 
 
@@ -79,18 +79,17 @@ def say_changes(run: "Run", console: Any) -> None:
 
 
 def task_name(name: str) -> str:
-    """The task's proper name; UserError with the close ones where there is none."""
+    """The task's proper name; UserError with the close ones where there is none, or where its file has no such task."""
     from bayessim_mjx import registry
+    from bayessim_mjx.outside_tasks import is_file
 
     registry.no_file(name, "--task")
-    if ":" in name:
+    if is_file(name):
+        registry.class_of(name)
         return name
-    known = {title.lower(): title for title in registry.names()}
-    if name.lower().replace("_", "") not in known:
-        if meant := [title for low, title in known.items() if f"-{low}-" in f"-{name.lower().replace('/', '-')}-"]:
-            raise UserError(f"--task {name!r} is unknown. Here it is called {meant[0]}")
-        raise unknown("--task", name, [*known.values(), *(f"{prefix}:<env>" for prefix in registry.EXTERNAL)])
-    return known[name.lower().replace("_", "")]
+    if name.split(":")[0] in registry.EXTERNAL and ":" in name:
+        return name
+    return registry.proper(name, "--task")
 
 
 def list_tasks() -> int:

@@ -1,4 +1,4 @@
-"""The work of `bayessim_mjx.gap_loop`: simulators from a diagnosis, policies trained once and kept, the results."""
+"""The work of `bayessim-mjx gap-loop`: simulators from a diagnosis, policies trained once and kept, the results."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def correction(diagnosis: result.Diagnosis, folder: Path, known: ParameterSpace)
     file = folder / EFFECTS
     found = storage.read(file) if file.is_file() else correction_of(diagnosis, known)
     if not found.effects and not found.calibrated:
-        raise UserError(f"--diagnosis {folder}: its verdict is {diagnosis.verdict!r}, so there is nothing to correct")
+        raise UserError(f"--diagnosis {folder}: its verdict is '{diagnosis.verdict}', so there is nothing to correct")
     return found
 
 

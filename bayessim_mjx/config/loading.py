@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from bayessim_mjx import outside_tasks
 from bayessim_mjx.config import foreign, rlpt
 from bayessim_mjx.config.layers import SECTIONS, Layer, merge
 from bayessim_mjx.config.settings import Config, EnvConfig, Frozen, Section, freeze
@@ -29,8 +30,11 @@ def cfg_folder() -> Path:
 
 
 def task_file(task: str) -> Path:
-    """cfg/<task in snake case>.yaml (which need not exist)."""
-    return cfg_folder() / (re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", task).lower() + ".yaml")
+    """cfg/<task in snake case>.yaml, or that beside the file of a task outside of the library; it need not exist."""
+    snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", outside_tasks.short(task)).lower()
+    own = cfg_folder() / f"{snake}.yaml"
+    ours = own.is_file() and not outside_tasks.is_file(task)
+    return own if ours else outside_tasks.settings_beside(task) or own
 
 
 def load(

@@ -3,6 +3,7 @@
     diagnose    the whole diagnosis in one call -> Diagnosis
     Diagnosis   the result: `.apply(physics)`, `.prior()`, `.save(folder)`
     load        a saved Diagnosis
+    Verdict     the seven verdicts and their words
     robot       the simulator under diagnosis, from an MJCF file, a specification or a compiled model
 
 Imported when first used, so that the commands start fast.
@@ -16,8 +17,9 @@ _WHERE = {
     "Diagnosis": ("result", "Diagnosis"),
     "load": ("result", "load"),
     "robot": ("fitting.robot", "robot_of"),
+    "Verdict": ("verdicts", "Verdict"),
 }
-__all__ = ["Diagnosis", "diagnose", "load", "robot"]
+__all__ = ["Diagnosis", "Verdict", "diagnose", "load", "robot"]
 
 
 def __getattr__(name: str) -> Any:

@@ -14,12 +14,13 @@ import numpy as np
 from bayessim_mjx import atomic
 from bayessim_mjx.diagnosis import correction
 from bayessim_mjx.diagnosis.correction import Estimate, FoundEffect
+from bayessim_mjx.diagnosis.verdicts import Verdict
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics
 
 SCHEMA = 1
-VERDICTS = ("no_gap", "parameters", "noise", "effects", "ambiguous", "unexplained", "insufficient_data")
+VERDICTS = tuple(Verdict)
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Diagnosis:
     """The whole result.
 
     Attributes:
-        verdict: one of VERDICTS; sentences: the verdict in words, most important first.
+        verdict: a `Verdict`, or its code; sentences: the verdict in words, most important first.
         parameters: {name: {"mean", "sd", "nominal", "low", "high", "unit", "structural": sentence or "",
             "data_sheet": sentence or "", "away": sd from the data sheet, where that is far,
             "simulated": value that fits at the simulator's time step; "mean" is the robot's,
@@ -112,6 +113,9 @@ class Diagnosis:
     accuracy: dict[str, dict[str, float]] = field(default_factory=dict)
     evidence: list[dict[str, Any]] = field(default_factory=list)
     schema: int = SCHEMA
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "verdict", Verdict(self.verdict))
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of diagnosis.json; numbers that are not finite become null."""

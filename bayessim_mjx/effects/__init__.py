@@ -8,17 +8,12 @@ import contextlib
 import dataclasses
 import difflib
 import functools
-import hashlib
 import importlib
 import importlib.metadata
-import importlib.util
 import inspect
 import keyword
 import pkgutil
-import sys
-import traceback
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from bayessim_mjx import trust
@@ -93,8 +88,8 @@ def recorded(spec: str) -> type[Effect]:
             raise UserError(f"effect {spec!r}: its package cannot be imported: {error}") from error
         return _checked(kind, spec, spec)
     close = difflib.get_close_matches(str(spec), names())
-    hint = f"did you mean {close[0]}? " if close else ""
-    raise UserError(f"no effect {spec!r}; {hint}there are: {', '.join(names())}; or a file: path.py:MyEffect")
+    hint = f"did you mean {close[0]}? docs/effects.md lists all" if close else f"there are: {', '.join(names())}"
+    raise UserError(f"no effect {spec!r}; {hint}; or a file: path.py:MyEffect")
 
 
 def known(name: str) -> type[Effect] | None:
@@ -107,38 +102,14 @@ def known(name: str) -> type[Effect] | None:
 
 
 def _from_file(path: Path, title: str) -> Any:
-    if not path.is_file():
-        raise UserError(f"effect {path}:{title}: no file {path} (from {Path.cwd()})")
-    trust.check(path, f"{path}:{title}")
-    path = path.resolve()
-    found = _executed(path, path.stat().st_mtime_ns)
+    found = trust.module_of(path, title, "effect", __name__)
     if not hasattr(found, title):
+        path = path.resolve()
         own = [n for n, kind in vars(found).items() if _is_effect(kind) and kind.__module__ == found.__name__]
         raise UserError(
             f"effect {path}:{title}: no class {title!r} in the file; its effects: {', '.join(own) or 'none'}"
         )
     return getattr(found, title)
-
-
-@functools.cache  # one class per file as it is now, so that equal effects are equal
-def _executed(path: Path, changed: int) -> ModuleType:
-    name = f"{__name__}.own_{path.stem}_{hashlib.sha1(f'{path}{changed}'.encode()).hexdigest()[:8]}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None and spec.loader is not None
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        del sys.modules[name]
-        raise UserError(f"{path}{_line(error, path)}: {type(error).__name__}: {error}") from error
-    return module
-
-
-def _line(error: BaseException, path: Path) -> str:
-    """Where in the user's file it went wrong."""
-    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
-    line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
-    return f", line {line}" if line else ""
 
 
 def _checked(kind: Any, spec: str, name: str | None = None) -> type[Effect]:

@@ -73,7 +73,9 @@ class Task(Env):
         self.settings = self._read(config if config is not None else {})
         self.variant: str = self.settings["variant"]
         self.episode_length = int(self.settings["episodeLength"])
-        randomization = randomization or getattr(self, "randomization", {})
+        randomization = randomization or {}
+        if "randomization_params" not in randomization:  # --randomize says only that there is some
+            randomization = {**getattr(self, "randomization", {}), **randomization}
         section = {} if randomization.get("randomize") is False else randomization.get("randomization_params", {})
         section = with_zeros(section, self.zeros)
         spec, mj_model, space = corrected(self.spec(), section, calibrated)

@@ -30,7 +30,9 @@ from bayessim_mjx.loop.round_inference import PREDICTIVE_DRAWS, infer, new_netwo
 from bayessim_mjx.loop.sources import Recorded, make_source
 from bayessim_mjx.loop.state import KEPT_ROUNDS, Loop, LoopState, RoundInfo, domain_or_prior
 from bayessim_mjx.loop.trajectories import no_motion
+from bayessim_mjx.loop.watching import Monitor, Watching
 from bayessim_mjx.parameters.ranged import Ranged
+from bayessim_mjx.progress import shown
 from bayessim_mjx.rl import Policy, TrainState
 from bayessim_mjx.rl.recurrent import remembering
 
@@ -38,13 +40,6 @@ __all__ = [
     "PREDICTIVE_DRAWS", "Checkpoints", "Loop", "LoopState", "Monitor", "RoundInfo", "checkpoint_step", "init", "make",
     "meta_of", "reexamine", "run", "score", "step", "train", "training_target", "tree_of",
 ]  # fmt: skip
-
-
-class Monitor(Protocol):
-    """Observer of the loop while it runs; every method may do nothing."""
-
-    def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None: ...
-    def round(self, info: RoundInfo, policy: Policy) -> None: ...
 
 
 class Checkpoints(Protocol):
@@ -211,12 +206,23 @@ def run(
     state: LoopState,
     checkpoints: Checkpoints | None = None,
     monitor: Monitor | None = None,
+    progress: bool | None = None,
 ) -> tuple[LoopState, list[RoundInfo]]:
     """All rounds from `state` on. Checkpoints every ppo.save_interval iterations and after each round.
 
     A round's checkpoint holds the state *after* it and the policy that was evaluated in it, so that "best" is the best
     evaluated policy.
+
+    Args:
+        progress: whether to show it on stderr; None: without a monitor, and on a terminal or in a notebook.
     """
+    with shown(False if progress is None and monitor is not None else progress) as show:
+        return _rounds(loop, state, checkpoints, Watching(show, loop, monitor))
+
+
+def _rounds(
+    loop: Loop, state: LoopState, checkpoints: Checkpoints | None, monitor: Watching
+) -> tuple[LoopState, list[RoundInfo]]:
     infos = []
     while int(state.round) < loop.settings.realIters:
         round_, last = int(state.round), [int(state.train.iteration)]
@@ -225,20 +231,19 @@ def run(
             metrics: dict, trained: TrainState, state: LoopState = state, round_: int = round_, last: list[int] = last
         ) -> None:
             current, every = dataclasses.replace(state, train=trained), loop.config.ppo.save_interval
-            if monitor is not None:
-                monitor.training(round_, metrics, current)
+            monitor.training(round_, metrics, current)
             if checkpoints is not None and int(trained.iteration) // every > last[0] // every:
                 last[0] = int(trained.iteration)
                 checkpoints.save(checkpoint_step(loop, round_, trained), tree_of(loop, current), meta=meta_of(current))
 
+        monitor.begin(round_)
         clock = time.perf_counter()
         state = train(loop, state, progress)
         seconds = time.perf_counter() - clock
         policy, number = rl.policy_of(state.train), checkpoint_step(loop, round_, state.train) + 1
         state, info = step(loop, state)
         info.seconds["train"] = seconds
-        if monitor is not None:
-            monitor.round(info, policy)  # first: a round that was not reported is not finished
+        monitor.round(info, policy)  # first: a round that was not reported is not finished
         if checkpoints is not None:
             evaluation, tree = float(info.returns.mean()), {"policy": policy, "state": state}
             # under logs every round is evaluated on its own physics: only the newest evaluation counts

@@ -18,6 +18,8 @@ from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.device import cores
 from bayessim_mjx.errors import DivergedError, UserError
 from bayessim_mjx.physics.warp import OVERFLOW, refuse_overflow
+from bayessim_mjx.progress import shown
+from bayessim_mjx.quantities import compact, is_number
 from bayessim_mjx.rl import catalogue, checks, distil, episodes, ppo, sharding
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.state import TrainState, policy_of
@@ -171,17 +173,31 @@ def train(
     *,
     state: TrainState | None = None,
     iterations: int | None = None,
-    progress: Callable[[Metrics, TrainState], None] | None = None,
+    progress: Callable[[Metrics, TrainState], None] | bool | None = None,
     mesh: Mesh | None = None,
 ) -> tuple[Policy, Metrics]:
     """Train from scratch or go on from a state: the policy, and metrics of the last interval.
 
     Args:
-        env, config, domain, iterations, progress: see `run`.
+        env, config, domain, iterations: see `run`.
         key, mesh: see `ppo.init`; not used with `state`.
         state: to go on from; None: `start`.
+        progress: a function, see `run`; or whether to show it on stderr, None: on a terminal or in a notebook.
     """
-    if state is None:
-        state = start(env, config, key, domain, mesh)
-    state, metrics = run(env, config, state, domain, iterations, progress)
+    own = progress if callable(progress) else None
+    with shown(False if own else progress) as show:
+        total = config.max_iterations if iterations is None else iterations
+        show("compiling the training", 0, 1)
+        if state is None:
+            state = start(env, config, key, domain, mesh)
+        begun = int(state.iteration)
+        show("training", 0, total)
+
+        def watch(metrics: Metrics, now: TrainState) -> None:
+            earned = metrics["Train/mean_reward"]  # NaN until an episode has ended
+            note = f"{compact(metrics['Perf/total_fps'])} steps/s"
+            note += f", return {compact(earned)}" if is_number(earned) else ""
+            show("training", int(now.iteration) - begun, total, note)
+
+        state, metrics = run(env, config, state, domain, iterations, own or watch)
     return policy_of(state), metrics

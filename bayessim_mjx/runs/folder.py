@@ -19,6 +19,7 @@ from typing import Any
 
 from bayessim_mjx import atomic, config
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.outside_tasks import short
 from bayessim_mjx.runs import checkpoints
 from bayessim_mjx.runs.manifest import FOLDER, MANIFEST, SCHEMA, advice, best_of, differences, read
 from bayessim_mjx.versions import git_state, versions
@@ -240,7 +241,7 @@ def latest_run(logdir: str | Path, task: str, with_checkpoint: bool = True) -> R
 
 
 def _folder_name(task: str) -> str:
-    return task.replace(":", "_").replace("/", "_")
+    return short(task).replace(":", "_").replace("/", "_")
 
 
 def _new_folder(parent: Path, name: str) -> Path:

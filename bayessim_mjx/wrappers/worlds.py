@@ -222,7 +222,7 @@ def worlds(task: Any, num_envs: int = 64, domain: Any = None, seed: int = 0, **e
     """Worlds of a task, or of a run's task under its posterior.
 
     Args:
-        task: a task's name, an environment, or the folder of a run of `bayessim_mjx.main` or `bayessim_mjx.train`:
+        task: a task's name, an environment, or the folder of a run of `main` or `train`:
             then everything of the environment is as in the run, and `domain` is its posterior unless another is given.
         num_envs: worlds in the batch.
         domain: where theta comes from, anew in each episode. None or "nominal": the nominal one; "prior": the task's

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from toy_runs import error_of
 
-from bayessim_mjx import main
+from bayessim_mjx import cli, main
 
 pytest.importorskip("shtab")
 
@@ -36,7 +36,7 @@ def test_bash_completes_commands_flags_tasks_and_files(tmp_path: Path, capsys: p
 @pytest.mark.parametrize("shell", ["zsh", "fish"])
 def test_other_shells_are_told_of_every_command(shell: str, capsys: pytest.CaptureFixture) -> None:
     text = script(shell, capsys)
-    assert all(name.replace("_", "-") in text for name in main.COMMANDS) and "max_iterations" in text
+    assert all(name in text for name in cli.COMMANDS) and "max_iterations" in text
 
 
 def test_another_shell_is_one_line(capsys: pytest.CaptureFixture) -> None:

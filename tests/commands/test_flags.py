@@ -2,9 +2,12 @@
 
 import ast
 import errno
+import re
 import runpy
+import shlex
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,7 @@ from toy_runs import SMALL, error_of
 
 import bayessim_mjx
 from bayessim_mjx import cli, diagnose, main, play, train
+from bayessim_mjx.cli.commands import module_of
 from bayessim_mjx.errors import UserError
 
 
@@ -42,7 +46,7 @@ from bayessim_mjx.errors import UserError
         (["--task", "Pendulum", "--seed", "9" * 20], ["seed = 99999999999999999999", "at most 4294967295"]),
         (["--task", "Pendulum", "--num_envs", str(10**13)], ["env.numEnvs = 10000000000000", "--num_envs", "at most"]),
         (["--task", "Pendulum", "--num_envs", "4", "ppo.num_envs=8"], ["--num_envs", "num_envs=8", "one setting"]),
-        ([], ["no task", "--list_tasks"]),
+        (["--seed", "1"], ["no task", "--list_tasks"]),
     ],
 )
 @pytest.mark.parametrize("command", [main.main, train.main])
@@ -87,25 +91,81 @@ def test_what_means_nothing_here_is_one_note(capsys: Any, tmp_path: Path, toy: N
 
 
 def test_help_and_task_list_need_no_task(capsys: pytest.CaptureFixture) -> None:
-    for command in (main.main, train.main, play.main):
-        assert command(["--help"]) == 0
-        assert "section.key=value" in capsys.readouterr().out
     assert main.main(["--list_tasks"]) == 0
     assert {"Pendulum", "Cartpole", "Ant"} <= set(capsys.readouterr().out.split())
 
 
-@pytest.mark.parametrize("name", main.COMMANDS)
-def test_one_console_script_takes_all_commands(name: str, capsys: pytest.CaptureFixture, monkeypatch: Any) -> None:
-    monkeypatch.setattr(sys, "argv", ["/usr/bin/bayessim-mjx"])
-    for written in {name, name.replace("_", "-")}:
-        assert main.main([written, "--help"]) == 0
-        usage = capsys.readouterr().out.split("\n\n")[0]
-        assert usage.startswith(f"usage: bayessim-mjx {name.replace('_', '-')} ")
+def shown(capsys: pytest.CaptureFixture, *argv: str) -> str:
+    """What a command prints that has to succeed."""
+    assert main.main(list(argv)) == 0
+    return capsys.readouterr().out
+
+
+def test_the_list_of_commands_has_groups_and_a_line_for_each(capsys: pytest.CaptureFixture) -> None:
+    text = shown(capsys, "--help")
+    assert text.startswith("usage: bayessim-mjx COMMAND [options]\n")
+    assert shown(capsys) == shown(capsys, "help") == shown(capsys, "-h") == text
+    lines = text.splitlines()
+    for name, command in cli.COMMANDS.items():
+        heading = lines.index(f"{command.group}:")
+        section = lines[heading + 1 : lines.index("", heading)]
+        assert [line.split()[1:] for line in section if line.split()[0] == name] == [command.about.split()]
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_help_has_one_spelling_groups_defaults_and_examples(name: str, capsys: Any, monkeypatch: Any) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    text = shown(capsys, name, "--help")
+    assert text.startswith(f"usage: bayessim-mjx {name} ") and max(map(len, text.splitlines())) <= 80
+    assert shown(capsys, name.replace("-", "_"), "--help") == shown(capsys, "help", name) == text
+    assert "bayessim_mjx." not in text
+    lines = text[text.index("\nexamples:\n") :].splitlines()
+    assert len([line for line in lines if line.startswith(f"  bayessim-mjx {name} ")]) == 2
+    flags = [line for line in text.splitlines() if line.startswith("  -")]
+    rows = text.splitlines()
+    assert all(len(f.split()) > 2 or rows[rows.index(f) + 1].startswith(" " * 8) for f in flags), flags
+    if name not in ("help", "completion", "logs"):
+        headings = [line for line in rows if line.endswith(":") and not line.startswith((" ", "usage", "options"))]
+        assert len(headings) >= 3 and "(default: " in text, headings
+
+
+def test_a_module_shows_the_help_of_its_command() -> None:
+    for module, name in (("main", "main"), ("gap_loop", "gap-loop"), ("blind_check", "blind"), ("import_logs", "logs")):
+        call = [sys.executable, "-m", f"bayessim_mjx.{module}", "--help"]
+        text = subprocess.run(call, check=True, capture_output=True, text=True).stdout
+        assert text.startswith(f"usage: bayessim-mjx {name} ")
+
+
+def test_the_examples_of_the_helps_are_accepted(monkeypatch: Any) -> None:
+    """By the parser; those that need nothing of the user's also by the settings."""
+    for name, command in cli.COMMANDS.items():
+        own = {"help": main._help_parser, "completion": main._completion_parser, "main": main._parser}
+        parser = own.get(name) or import_module(f"bayessim_mjx.{module_of(name)}")._parser
+        for example in command.examples:
+            words = shlex.split(example)
+            args = parser().parse(words) if isinstance(parser(), cli.Parser) else parser().parse_args(words)
+            if "--task" in words and isinstance(parser(), cli.Parser) and "LOGS" not in example:
+                assert cli.config_of(args).task == args.task
+
+
+def test_messages_spell_commands_as_the_helps_do() -> None:
+    """`python -m` and names of modules are for programs; a person types `bayessim-mjx COMMAND`."""
+    modules = "|".join(module_of(name) for name in cli.COMMANDS if name not in ("help", "completion"))
+    package = Path(bayessim_mjx.__file__).parent
+    found = {
+        file.relative_to(package).as_posix(): re.findall(rf"python -m bayessim_mjx\.(?:{modules})\b", file.read_text())
+        for file in [*package.rglob("*.py"), *package.rglob("*.json"), *package.rglob("*.j2")]
+    }
+    assert {name: calls for name, calls in found.items() if calls} == {"main.py": ["python -m bayessim_mjx.main"]}
+
+
+def test_flags_and_settings_without_a_command_are_those_of_main(capsys: pytest.CaptureFixture) -> None:
+    assert error_of(capsys, main.main, "--tsk", "Ant") == error_of(capsys, main.main, "main", "--tsk", "Ant")
 
 
 def test_a_command_that_does_not_exist_is_one_line(capsys: pytest.CaptureFixture) -> None:
     line = error_of(capsys, main.main, "gap-lop", "--task", "Pendulum")
-    assert "command 'gap-lop' is unknown. Did you mean gap-loop?" in line and "calibrate, diagnose" in line
+    assert "command 'gap-lop' is unknown. Did you mean gap-loop?" in line and "train, play" in line
 
 
 def test_version(capsys: pytest.CaptureFixture) -> None:
@@ -121,18 +181,6 @@ def test_flags_are_read_before_jax_is_imported() -> None:
     for call in (["diagnose", "--help"], ["--version"], ["nothing"]):
         code = f"import sys; from bayessim_mjx.main import main; main({call}); assert not ({slow}), {slow}"
         subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
-
-
-def test_help_fits_into_80_columns(monkeypatch: Any, capsys: pytest.CaptureFixture) -> None:
-    from bayessim_mjx import calibrate, diagnose, gap_loop, implementations, import_logs
-
-    monkeypatch.setenv("COLUMNS", "80")
-    for command in (main, train, play, calibrate, diagnose, gap_loop, import_logs, implementations):
-        assert command.main(["--help"]) == 0
-        usage, *lines = capsys.readouterr().out.splitlines()
-        assert usage.startswith(f"usage: python -m {command.__name__} ") and max(map(len, [usage, *lines])) <= 80
-        flags = [line for line in lines if line.startswith("  -")]
-        assert all(len(line.split()) > 2 or lines[lines.index(line) + 1].startswith(" " * 8) for line in flags), flags
 
 
 def test_every_ancestor_flag_is_known() -> None:

@@ -37,7 +37,7 @@ def test_play_draws_from_the_posterior_in_the_coordinates_that_it_was_saved_in(t
     centre = np.asarray(to_chart(env.space.to_unit(np.float32([1.5, 1.9])), "probit"))
     posterior = Distribution.from_unit(env.space, [0.0], [centre], 0.05 * np.eye(2)[None], chart="probit")
     checkpoints.save(tmp_path / "1", {"state": {"domain": posterior}}, 1, {})
-    drawn = np.asarray(play._physics(settings, env, tmp_path / "1", key, 400)["posterior"])
+    drawn = np.asarray(play._physics(settings, env, tmp_path / "1", key, 400)["posterior"]())
     np.testing.assert_array_equal(drawn, posterior.sample(key, 400))
     np.testing.assert_allclose(drawn.mean(0), [1.5, 1.9], atol=0.01)
 

@@ -42,7 +42,7 @@ def test_episodes_have_the_masses_of_the_file_that_is_the_domain(evaluated: list
     before = len(evaluated)  # what a run was trained on goes on with it, is played, and is a domain in its turn
     assert train.main([*ARGV, "--domain", str(run.path), "--logdir", "more"]) == 0
     assert np.abs(np.concatenate(evaluated[before:]) - 1.7).max() < 0.01
-    drawn = play._physics(run.config, TOY, run.checkpoint("latest"), jax.random.PRNGKey(0), 50)["posterior"]
+    drawn = play._physics(run.config, TOY, run.checkpoint("latest"), jax.random.PRNGKey(0), 50)["posterior"]()
     assert np.abs(np.asarray(drawn) - 1.7).max() < 0.01
 
 

@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
+from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
 
 import mujoco
@@ -87,6 +89,48 @@ def test_a_path_is_a_model_and_a_plain_name_a_task():
         bayessim_mjx.diagnose("x.xml", "logs")
     with pytest.raises(UserError, match="'x' is unknown.*Pendulum"):
         bayessim_mjx.diagnose("x", "logs")
+
+
+def test_a_robot_of_a_task_has_its_name_and_model():
+    robot = bayessim_mjx.robot("pendulum")
+    assert robot.name == "Pendulum" and robot.mj_model.nu == 1
+    with pytest.raises(UserError, match="'x' is unknown.*Pendulum"):
+        bayessim_mjx.robot("x")
+
+
+@pytest.mark.parametrize("more", [{}, {"verdict_only": True}])
+def test_out_writes_what_the_command_writes(more, tmp_path, monkeypatch, capsys):
+    """The computation is replaced by a result, which both write."""
+    nominal(tmp_path)
+    calls = []
+
+    def diagnose(robot, logs, **options):
+        calls.append((robot.name, options))
+        fake.full().save(options["out"])
+        return fake.full()
+
+    monkeypatch.setattr(run, "diagnose", diagnose)
+    model, flags = str(tmp_path / "pendulum.xml"), [f"--{flag}" for flag in more]
+    words = ["--model", model, "--data", "logs", "--out", str(tmp_path / "a"), "--accuracy", "5%", "--headless", *flags]
+    assert bayessim_mjx.diagnose.main(words) == 0
+    assert "Missing effects found (effects), after" in capsys.readouterr().out
+    found = bayessim_mjx.diagnose(model, ["logs"], out=tmp_path / "b", accuracy=["5%"], **more)
+    assert capsys.readouterr().err == "" and found.verdict == "effects"
+    kinds = [{re.sub(r"[0-9.]+", "#", f.name) for f in (tmp_path / folder).rglob("*")} for folder in "ab"]
+    assert kinds[0] == kinds[1] and ("report#html" in kinds[0]) is not bool(more)
+    (name, asked), (same, given) = calls
+    both = {*asked} & {*given} - {"out", "progress"}
+    assert name == same and {"accuracy", *more} <= both and {k: asked[k] for k in both} == {k: given[k] for k in both}
+
+
+def test_verdicts_have_words_that_the_report_has_too():
+    from bayessim_mjx.report import words
+
+    assert [v.words for v in diagnosis.Verdict] == [words.VERDICTS[v].badge for v in diagnosis.Verdict]
+    page = (Path(__file__).parents[2] / "docs" / "diagnosis.md").read_text().lower()
+    assert [v.words for v in diagnosis.Verdict if v.words.lower() not in page] == []
+    assert diagnosis.Verdict("effects") == "effects" == f"{fake.full().verdict}"
+    assert json.loads(json.dumps(fake.full().to_dict()))["verdict"] == "effects"
 
 
 def test_a_robot_comes_from_a_file_a_specification_a_model_or_itself(tmp_path):

@@ -102,7 +102,7 @@ def test_the_same_seed_gives_the_same_worlds():
         (lambda w: w.set_theta([1.0, 2.0, 3.0]), r"theta has shape \[3\]; expected \[1\] or \[2, 1\]"),
         (lambda w: Worlds(ENV, None, 0), "num_envs = 0"),
         (lambda w: worlds(ENV, episodeLength=3), "episodeLength: settings go with a task's name"),
-        (lambda w: worlds("Pendulun"), "did you mean Pendulum"),
+        (lambda w: worlds("Pendulun"), "Did you mean Pendulum"),
         (lambda w: domain_of(ENV, "posteriour"), "domain = 'posteriour': allowed are nominal, prior"),
     ],
 )

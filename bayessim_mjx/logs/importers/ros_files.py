@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -33,8 +34,9 @@ def of_mcap(path: Path) -> Iterator[Message]:
             for schema, channel, message, body in reader.iter_decoded_messages(topics=topics or None):
                 kind, sent = _short(_name(schema)), int(message.publish_time or message.log_time)
                 yield Message(channel.topic, kind, sent, body, str(channel.id))
-    except (errors, EOFError) as error:
-        raise UserError(f"{path}: not a readable MCAP file of ROS 2 messages ({error})") from None
+    except (errors, EOFError, struct.error, OSError) as error:
+        allowed = "allowed: an .mcap file"
+        raise UserError(f"{path}: not a readable MCAP file of ROS 2 messages ({error}); {allowed}") from None
 
 
 def of_rosbag(path: Path) -> Iterator[Message]:

@@ -1,0 +1,142 @@
+"""Progress of a computation in stages: bars on a terminal, elsewhere lines with counts and the time to go.
+
+Functions that take long have an argument `progress`: None shows it where a person watches (`watched`), True always,
+False never; a function `(stage, done, total)` is called instead.
+"""
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol, TextIO
+
+from bayessim_mjx.quantities import duration
+
+EVERY = 10.0  # s between two lines of one stage
+
+
+class Show(Protocol):
+    """Where progress goes."""
+
+    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
+        """`done` of `total` parts of a stage are done; `note`: a result so far."""
+
+    def line(self, text: str) -> None:
+        """A result that stays on the screen."""
+
+
+Wanted = bool | Callable[..., Any] | None  # an argument `progress`
+
+
+def watched() -> bool:
+    """Whether a person sees standard error: it is a terminal, or that of a notebook."""
+    if sys.stderr.isatty():
+        return True
+    ipython = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython is not None else None
+    return getattr(shell, "kernel", None) is not None
+
+
+class Silent:
+    """Shows nothing."""
+
+    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
+        pass
+
+    def line(self, text: str) -> None:
+        pass
+
+
+class Lines:
+    """A line when a stage begins and every EVERY s while it lasts: elapsed time, stage, count, time to go.
+
+    Args:
+        file: where to; now: clock in seconds.
+    """
+
+    def __init__(self, file: TextIO, now: Callable[[], float] = time.monotonic):
+        self.file, self.now, self.began = file, now, now()
+        self.stage, self.since, self.first, self.reported = "", self.began, 0, 0.0
+
+    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
+        now = self.now()
+        if stage != self.stage:
+            self.stage, self.since, self.first, self.reported = stage, now, done, -EVERY
+        if now - self.reported >= EVERY:
+            self.reported = now
+            counted = f": {done} of {total}{self._left(now, done, total)}" if total > 1 else ""
+            self.line(f"{now - self.began:6.1f} s  {stage}{counted}{f', {note}' if note else ''}")
+
+    def line(self, text: str) -> None:
+        print(text, file=self.file, flush=True)
+
+    def _left(self, now: float, done: int, total: int) -> str:
+        """Time to go in this stage, from what was done in it."""
+        made = done - self.first
+        return (
+            f", about {duration((now - self.since) / made * (total - done))} left" if made > 0 and done < total else ""
+        )
+
+
+class Bars:
+    """A bar for each stage, with the time to go."""
+
+    def __init__(self, bars: Any):
+        self.bars = bars
+        self.stages: dict[str, Any] = {}
+
+    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
+        if stage not in self.stages:
+            for other in self.stages.values():
+                self.bars.update(other, completed=self.bars.tasks[other].total)
+            self.stages[stage] = self.bars.add_task(stage, total=max(total, 1))
+        shown = f"{stage}, {note}" if note else stage
+        self.bars.update(self.stages[stage], description=shown, completed=done, total=max(total, 1))
+
+    def line(self, text: str) -> None:
+        self.bars.console.print(text, highlight=False, markup=False)
+
+
+@contextlib.contextmanager
+def stages(headless: bool) -> Iterator[Show]:
+    """Progress on stderr: bars on a terminal unless `headless`, else lines."""
+    if headless or not sys.stderr.isatty():
+        yield Lines(sys.stderr)
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        SpinnerColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    text, bar = TextColumn("{task.description}", markup=False), BarColumn()
+    columns = (SpinnerColumn(), text, bar, MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True, console=Console(stderr=True)) as bars:
+        yield Bars(bars)
+
+
+@contextlib.contextmanager
+def shown(progress: Wanted) -> Iterator[Show]:
+    """Where the progress of a function goes whose argument `progress` this is."""
+    if callable(progress):
+        yield _Caller(progress)
+    elif progress or (progress is None and watched()):
+        with stages(headless=False) as show:
+            yield show
+    else:
+        yield Silent()
+
+
+class _Caller(Silent):
+    """Calls the user's function."""
+
+    def __init__(self, function: Callable[..., Any]):
+        self.function = function
+
+    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
+        self.function(stage, done, total)

@@ -1,0 +1,73 @@
+"""Progress: lines with counts and the time to go; shown where a person watches, and nowhere else unless asked for."""
+
+import io
+import sys
+import types
+
+import pytest
+
+from bayessim_mjx import progress
+from bayessim_mjx.progress import EVERY, Lines
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def notebook(monkeypatch, kernel):
+    """IPython is imported; its shell has this kernel."""
+    ipython = types.SimpleNamespace(get_ipython=lambda: types.SimpleNamespace(kernel=kernel))
+    monkeypatch.setitem(sys.modules, "IPython", ipython)
+
+
+def test_a_person_watches_a_terminal_or_a_notebook(monkeypatch):
+    monkeypatch.delitem(sys.modules, "IPython", raising=False)
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    assert not progress.watched()
+    notebook(monkeypatch, None)  # IPython in a pipe
+    assert not progress.watched()
+    notebook(monkeypatch, "a kernel")
+    assert progress.watched()
+    monkeypatch.delitem(sys.modules, "IPython")
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    assert progress.watched()
+
+
+@pytest.mark.parametrize(("wanted", "people", "shows"), [
+    (None, False, False), (None, True, True), (False, True, False), (True, False, True),
+])  # fmt: skip
+def test_progress_is_shown_to_people_or_on_request(wanted, people, shows, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Terminal() if people else io.StringIO())
+    monkeypatch.delitem(sys.modules, "IPython", raising=False)
+    with progress.shown(wanted) as show:
+        show("training", 1, 2, "return -3")
+        show.line("round 1/2: return -3")
+    text = sys.stderr.getvalue()
+    assert ("round 1/2: return -3" in text) is shows and bool(text) is shows
+
+
+def test_a_function_is_called_in_its_place(capsys):
+    calls = []
+    with progress.shown(lambda *call: calls.append(call)) as show:
+        show("training", 1, 2, "return -3")
+        show.line("round 1/2")
+    assert calls == [("training", 1, 2)] and capsys.readouterr() == ("", "")
+
+
+def test_lines_have_counts_and_the_time_to_go():
+    clock, file = iter([0.0, 1.0, 2.0, 1.0 + EVERY, 5.0 + EVERY, 6.0 + EVERY, 7.0 + EVERY]), io.StringIO()
+    say = Lines(file, lambda: next(clock))
+    say("known parameters", 0, 1)
+    say("pairs", 0, 21)  # at 2 s
+    say("pairs", 6, 21)  # 9 s later: not yet
+    say("pairs", 6, 21)  # 13 s after it began: 15 more take 32 s
+    say("pairs", 9, 21)
+    say("rivals", 0, 3)
+    lines = file.getvalue().splitlines()
+    assert lines == [
+        "   1.0 s  known parameters",
+        "   2.0 s  pairs: 0 of 21",
+        "  15.0 s  pairs: 6 of 21, about 32 s left",
+        "  17.0 s  rivals: 0 of 3",
+    ]
