@@ -179,7 +179,7 @@ def make(task: str, runs: Path | None) -> str | None:
 def captioned(page: str, shown: dict[str, str]) -> str:
     """The page of films, with what each of them shows."""
     for task, words in shown.items():
-        page = re.sub(rf"(\*\*{task}\*\*: .*Shown: ).*(</figcaption>)", rf"\g<1>{words}.\g<2>", page)
+        page = re.sub(rf"(\*\*{task}\*\*: .*Shown: ).*?\.( \|)", rf"\g<1>{words}.\g<2>", page)
     return page
 
 

@@ -92,9 +92,11 @@ class Parts(Task):
         return view.qpos[2:3]
 
     def observe_velocity(self, view: View) -> jax.Array:
+        """Of the base in its own axes, m/s."""
         return view.velocity
 
     def observe_turning(self, view: View) -> jax.Array:
+        """Of the base in its own axes, rad/s."""
         return view.turning
 
     def observe_gravity(self, view: View) -> jax.Array:
@@ -106,6 +108,7 @@ class Parts(Task):
         return _running.heading(view.qpos)
 
     def observe_commands(self, view: View) -> jax.Array:
+        """As drawn at reset, m/s and rad/s."""
         return jnp.stack([view.asked(name) for name in self.commands])
 
     def observe_joints(self, view: View) -> jax.Array:
@@ -113,9 +116,11 @@ class Parts(Task):
         return view.qpos[7:] - self.home_joints
 
     def observe_scaled_joints(self, view: View) -> jax.Array:
+        """From -1 to 1 between their limits."""
         return self.scaled_joints(view.qpos)
 
     def observe_joint_speeds(self, view: View) -> jax.Array:
+        """Of the joints, rad/s or m/s."""
         return view.qvel[6:]
 
     def observe_joint_forces(self, view: View) -> jax.Array:
@@ -127,9 +132,11 @@ class Parts(Task):
         return _running.foot_loads(self.sys, self.mj_model, view.data, self.feet)
 
     def observe_actions(self, view: View) -> jax.Array:
+        """The last ones."""
         return view.action
 
     def reward_alive(self, view: View) -> jax.Array:
+        """1 in every step."""
         return jnp.ones(())
 
     def reward_progress(self, view: View) -> jax.Array:
