@@ -10,6 +10,7 @@ import pytest
 from bayessim_mjx.diagnosis import tolerance
 from bayessim_mjx.diagnosis.evidence.force_left import ForceLeft
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
+from bayessim_mjx.diagnosis.residual.origin import Origin
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.summary import how_far, verdict
@@ -148,6 +149,12 @@ def test_effects_that_leave_a_large_share_are_no_explanation():
     """330 of 1000 noises are 11 % of the squared gap."""
     assert verdict.verdict_of(findings(330.0), gap(0.033)).name == "unexplained"
     assert verdict.verdict_of(findings(300.0), gap(0.03)).name == "effects"  # 9 %
+
+
+def test_effects_that_close_less_than_they_leave_are_no_explanation_even_beside_noisy_sensors(monkeypatch):
+    monkeypatch.setattr(verdict, "sensors_noise", lambda found: Origin(0.0, 0.0, 0.0, 0.0))
+    assert verdict.verdict_of(findings(700.0), gap(0.070)).name == "effects"  # 49 % is left
+    assert verdict.verdict_of(findings(720.0), gap(0.072)).name == "unexplained"  # 52 %
 
 
 @pytest.mark.parametrize(

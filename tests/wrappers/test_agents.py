@@ -108,7 +108,7 @@ def test_main_trains_with_our_own_ppo_alone(capsys):
     from bayessim_mjx.main import main
 
     assert main(["--task", "Cartpole", "agent=sb3"]) == 2
-    assert "train --agent has others" in capsys.readouterr().err
+    assert "bayessim-mjx train --agent" in capsys.readouterr().err
 
 
 def test_an_agent_that_is_not_there_is_named():

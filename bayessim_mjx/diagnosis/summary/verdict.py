@@ -13,7 +13,7 @@ from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.evidence.sets import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
-from bayessim_mjx.diagnosis.gap import of_one
+from bayessim_mjx.diagnosis.gap import of_one, of_rms
 from bayessim_mjx.diagnosis.residual.origin import Origin, origin
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
@@ -77,7 +77,10 @@ def verdict_of(found: Findings, far: Gap) -> Verdict:
     noise = sensors_noise(found) if probable or force.noise > FLOOR**2 else None
     missing = probable and noise is None
     off = bent(found.model) if found.model.effects else (0, 0)
-    name = "unexplained" if missing or any(off) else _explained(found, noise)
+    # noise of the sensors excuses a remainder, and not that the effects close little
+    gap_of_effects = of_rms(far.calibrated, far.with_effects)
+    little = bool(found.model.effects) and not gap_of_effects.left <= gap_of_effects.closed
+    name = "unexplained" if missing or any(off) or little else _explained(found, noise)
     return Verdict(name, force.motion / gap if missing else 0.0, chance, noise, off, builds_up(found, far))
 
 
