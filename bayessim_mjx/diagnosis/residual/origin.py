@@ -23,10 +23,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """What is tried, and how much is looked at.
+    """The grids of the two covariances, and how much of the residuals they are held against.
 
     All of 8 cases with coloured noise and jitter are called noise, all of 8 unknown causes forces: the rule was made on
-    these. Of 48 fresh unknown causes none was called noise (c3b3eb0).
+    these. Counted on fresh unknown causes: none of 48 was called noise (c3b3eb0), one of 19 (3ed74ea). Play and an
+    elastic gear behind which the motor vibrates look like noise, too (2 of 2 there).
 
     Attributes:
         memories: of a window's length; amounts: of the white part's variance; a grid each.
