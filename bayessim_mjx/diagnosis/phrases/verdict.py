@@ -210,7 +210,7 @@ def stage(far: Gap, name: str) -> str:
 
 
 def gap_line(far: Gap, effects: bool) -> str:
-    """The three gap numbers on one line: as delivered, recalibrated, with the effects."""
+    """The three gap numbers on one line of the terminal (the page has tiles, `report.sections`)."""
     words = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
     known = [s for s in words if finite(getattr(far, s)) and (effects or s != "with_effects")]
     return "Gap: " + ", ".join(f"{stage(far, s)} {words[s]}" for s in known) + "." if known else ""
