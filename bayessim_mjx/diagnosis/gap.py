@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 # Root mean square residual, in noise standard deviations, up to which a model is at the noise. It decides words, and
-# whether the gap is located; verdicts rest on `search_state.FLOOR` and on the force that is left. Counted:
+# whether the gap is located; verdicts rest on `selection.numbers.FLOOR` and on the force that is left. Counted:
 # docs/decisions/at_noise.md
 AT_NOISE = 1.15
 

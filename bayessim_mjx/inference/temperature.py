@@ -1,4 +1,6 @@
-"""The width of posteriors: one factor on their standard deviations, by held-out truths.
+"""One factor on the standard deviations of posteriors, by held-out truths.
+
+The width of the posterior of several trajectories: `product_calibration.Sets.widening`.
 
 The temperature has the highest mean log density at the truths. The coverage factor makes regions hold as many truths as
 they should.

@@ -324,7 +324,7 @@ def paged(text: str, found: dict[str, Any]) -> str:
 
 
 def _cell(row: Sequence[str] | None) -> str:
-    return f"{row[4]}, {row[5]}, {row[6]} of {row[3]}" if row else "the same number"
+    return f"{row[4]}, {row[5]}, {row[6]} of {row[3]}" if row else "not counted"
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -67,7 +67,7 @@ def test_the_record_counts_what_changes_and_the_page_shows_it(tmp_path):
     assert json.loads(sensitivity.written(found)) == found
     page = "| `Odds.strong` | 20 | what | | |\n| `Odds.mention` | 3 | what | | |"
     assert sensitivity.paged(page, found).split("\n") == [
-        "| `Odds.strong` | 20 | what | 1, 1, 1 of 2 | the same number |", "| `Odds.mention` | 3 | what | | |",
+        "| `Odds.strong` | 20 | what | 1, 1, 1 of 2 | not counted |", "| `Odds.mention` | 3 | what | | |",
     ]  # fmt: skip
 
 

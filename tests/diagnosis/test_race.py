@@ -98,7 +98,7 @@ def test_without_time_the_first_answer_says_what_was_not_tried(setup, monkeypatc
     short = searched(setup, seconds=36.0, now=lambda: float(next(clock)))
     assert short.answer.label == SPRING and len(short.state.cut_short) == 2
     assert not_fitted(short.state) == {phrases.NO_TIME_LEFT: sorted(short.state.cut_short, key=labels(setup).index)}
-    assert "no time was left for 2 single effects" in not_tried(short.state)
+    assert "2 single effects" in not_tried(short.state)["parts"]
 
 
 def test_when_the_time_is_over_the_verdict_rests_on_what_is_fitted(setup, counted_whole):

@@ -33,11 +33,11 @@ from bayessim_mjx.diagnosis.evidence.gaussian import (
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.selection.models import Key
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 from bayessim_mjx.diagnosis.statistics import Z90
 
 Array = NDArray[np.float64]
 ENDS = ndtr((-Z90, Z90))  # of a 90 % interval
-GAIN = 0.1  # nats that a turn for the noise alone gains at least; odds are in whole nats; a rule of thumb
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def _without(windows: Windows, belief: Belief, hyper: Hyper) -> float:
     while True:
         there = marginal(windows, hyper)
         value = _density(belief, there, hyper)
-        if value - last < GAIN:
+        if not value - last >= EFFORT.tolerance:  # NaN ends it too
             return max(value, last)
         one = np.concatenate([[1.0], -belief.best(there.Q.sum(0))])
         along = np.concatenate([np.tile(one, (count, 1)), -there.mean @ one @ there.root.T], 1)
@@ -210,7 +210,10 @@ class _Forces:
     def in_amplitude(self, hyper: Hyper) -> tuple[Array, Array, Array]:
         """(slope `[nv]`, minus the second derivative `[nv, nv]` of the log density in log a; that of E `[nv]`)."""
         W, F = self.u.shape
-        own = lambda x: x.reshape(W, self.joints, -1)  # noqa: E731
+
+        def own(x: Array) -> Array:
+            return x.reshape(W, self.joints, -1)
+
         square = own(self.u**2 + np.einsum("wii->wi", self.C)).sum((0, 2))
         slope = square - W * F / self.joints - np.log(hyper.amplitude / PRIORS.usual) / PRIORS.spread**2
         block = self.C.reshape(W, self.joints, F // self.joints, self.joints, -1)

@@ -19,6 +19,7 @@ from bayessim_mjx.diagnosis.experiment.limits import Drives, Limits, limits_of
 from bayessim_mjx.diagnosis.experiment.rehearsal import Played, Rehearsal
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.phrases import experiment as phrases
+from bayessim_mjx.diagnosis.phrases.effects import all_of
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model, nats
 from bayessim_mjx.diagnosis.selection.search_state import ranked
@@ -290,7 +291,7 @@ def _floats(model: mujoco.MjModel) -> bool:
 
 def title(model: Model) -> str:
     """Of a model, by its effects."""
-    return phrases.model_title([(c.effect, c.where) for c in model.effects])
+    return all_of([(c.effect, c.where) for c in model.effects])
 
 
 def missing_streams(models: Sequence[Model], logs: Sequence[Log]) -> list[str]:
@@ -313,7 +314,7 @@ def reason(scorer: Scorer, chosen: Scored | None, labels: Sequence[str], contest
     if len(labels) == 1:
         index, variance = scorer.loosest(0)
         c, before = scorer.models[0].fit.coordinates[index], math.sqrt(variance)
-        change = c.name, before, before * math.exp(-chosen.evidence), c.unit
+        change = c.name, before, before * math.exp(-chosen.evidence)
         return phrases.sharpens(action, *change) if useful else phrases.sharpens_little(chosen.name, *change)
     if not useful:
         return phrases.separates_nobody(labels, chosen.name, chosen.evidence, instead(scorer.models))

@@ -30,6 +30,7 @@ class Rules:
 
     lanes: int = 32  # worlds in one call; the results do not depend on it
     rounds: int = 5  # of making an experiment smaller until it is safe
+    shrink: float = 0.7  # a round: more than what is over, since a part of it does not shrink along (gravity)
 
 
 RULES = Rules()
@@ -130,8 +131,7 @@ class Rehearsal:
                 log = self._log(excitations[k], *own[0])
                 done[k] = Played(excitations[k], float(scale[k]), log, worst, worst <= KEPT)
             left = [k for k in left if not done[k].safe]
-            # squared, since some of it does not shrink along, as what gravity pulls; no more than to a half
-            scale[left] *= [max(done[k].worst ** -2, 0.5) for k in left]
+            scale[left] *= RULES.shrink
             if not left:
                 break
         return [done[k] for k in range(len(excitations))]

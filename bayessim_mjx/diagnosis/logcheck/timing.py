@@ -5,7 +5,9 @@ Each lateness has one estimator, since each is another quantity:
 - velocities behind the derivatives of their positions: `logs.velocities`, lags over all measured rows;
 - motion behind the effort: `effort`, where the bounded inverse dynamics of a log explain most;
 - measured efforts behind the stamps of their commands: `offset`, where the two columns correlate most;
-- commands behind (or before) their rows: `fitting.command_shift`, by simulation, beside all that forces can explain.
+- commands behind (or before) their rows: `fitting.command_shift`, by simulation, beside all that forces can explain;
+- jitter of the stamps themselves: `logs.stamps`;
+- what no estimator is sure of, up to a part of a row: nuisance numbers of every fit, `evidence.doubts`.
 
 Three more are no clocks. `drive_channel.Channel.late` is the mean time by which a drive answers a held command: of its
 own lag as well, and from where the command acts, half a row behind its stamp. The term "lateness" of

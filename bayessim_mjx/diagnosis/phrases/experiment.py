@@ -5,11 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from bayessim_mjx.diagnosis.phrases.effects import all_of as model_title
 from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import listed
-
-__all__ = ["model_title"]
 
 
 def known_payload(mass: float, place: str) -> tuple[str, str]:
@@ -47,7 +44,7 @@ def run_experiment(name: str, seconds: float) -> str:
     return f"run {article}{name} for {seconds:.0f} s"
 
 
-def sharpens(action: str, parameter: str, before: float, after: float, unit: str) -> str:
+def sharpens(action: str, parameter: str, before: float, after: float) -> str:
     """The gain in accuracy of a parameter, where no rival is left.
 
     As a ratio: both are of noise alone, and so smaller than the standard deviation that the diagnosis reports.
@@ -55,9 +52,9 @@ def sharpens(action: str, parameter: str, before: float, after: float, unit: str
     return f"{action}: it should divide the standard deviation of {parameter} by {before / after:.2g}"
 
 
-def sharpens_little(best: str, parameter: str, before: float, after: float, unit: str) -> str:
+def sharpens_little(best: str, parameter: str, before: float, after: float) -> str:
     """Why an experiment does not help, of its name and the parameter that it measures best."""
-    return f"no experiment of the menu adds much; the best, {sharpens(best, parameter, before, after, unit)}"
+    return f"no experiment of the menu adds much; the best, {sharpens(best, parameter, before, after)}"
 
 
 def separates_nobody(labels: Sequence[str], best: str, evidence: float, help: str) -> str:

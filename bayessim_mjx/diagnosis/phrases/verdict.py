@@ -24,6 +24,7 @@ PARTLY_HEAD = "Partly explained: {named}; more than the tolerance remains at {be
 REST = "More than the tolerance remains at {beyond}."
 IMPERFECT = "No candidate closes the rest, {rest} of the squared gap: the law is not quite that of the real system."
 NEAREST = "Nearest in the library: {nearest}."
+LITTLE = "This is less than half: {they} {explain} little of the gap."
 ON_TOP = "Beside {them} a force is missing: it makes {remains} of the squared gap."
 FALLS = (
     "On held-out {held} {they} {reduce} the gap from {calibrated} to {with_effects}: {shown} of the squared gap above "
@@ -112,6 +113,7 @@ def _fill(d: Diagnosis) -> dict[str, str]:
         "them": "it" if one else "them",
         "they": "the effect" if one else "the effects",
         "reduce": "reduces" if one else "reduce",
+        "explain": "explains" if one else "explain",
         "held": "parts of the log" if far.in_sample else "conditions",
         "one": "part of the log" if far.in_sample else "condition",
         "beyond": listed([_left(n, far.physical[n]) for n in worst if n in far.beyond], most=3),
@@ -132,6 +134,7 @@ def _how_far(d: Diagnosis) -> list[str]:
         out += [NEAREST.replace("{nearest}", "; ".join(map(named.line, d.effects)))] if nearest else []
         out.append(FALLS)
         if d.verdict == "unexplained":
+            out += [LITTLE] if of_rms(far.calibrated, far.with_effects).closed < left else []
             remains = basis.get("remains") or 0.0
             out += [ON_TOP.replace("{remains}", percent(remains))] if remains > 0 else []
         out += [IMPERFECT] if far.beyond and d.verdict != "unexplained" and left > 0 else []
@@ -210,7 +213,7 @@ def stage(far: Gap, name: str) -> str:
 
 
 def gap_line(far: Gap, effects: bool) -> str:
-    """The three gap numbers on one line: as delivered, recalibrated, with the effects."""
+    """The three gap numbers on one line of the terminal (the page has tiles, `report.sections`)."""
     words = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
     known = [s for s in words if finite(getattr(far, s)) and (effects or s != "with_effects")]
     return "Gap: " + ", ".join(f"{stage(far, s)} {words[s]}" for s in known) + "." if known else ""

@@ -77,9 +77,9 @@ def verdict_of(found: Findings, far: Gap) -> Verdict:
     noise = sensors_noise(found) if probable or force.noise > FLOOR**2 else None
     missing = probable and noise is None
     off = bent(found.model) if found.model.effects else (0, 0)
-    # noise of the sensors excuses a remainder, and not that the effects close little
-    gap_of_effects = of_rms(far.calibrated, far.with_effects)
-    little = bool(found.model.effects) and not gap_of_effects.left <= gap_of_effects.closed
+    # noise of the sensors excuses a remainder, and not that the effects close little of what is above it
+    above = of_rms(far.calibrated, far.with_effects, math.sqrt(max(force.noise, 1.0)))
+    little = bool(found.model.effects) and above.left > above.closed
     name = "unexplained" if missing or any(off) or little else _explained(found, noise)
     return Verdict(name, force.motion / gap if missing else 0.0, chance, noise, off, builds_up(found, far))
 

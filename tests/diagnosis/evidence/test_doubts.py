@@ -99,7 +99,7 @@ def test_a_lag_of_velocities_is_found_and_moves_no_parameter(tmp_path):
     scored = Weighing(pool).scored[BASE]
     step = scored.learnt.step[len(pool.base.fit.values) :]
     assert len(step) == 3 and abs(step[2]) < 0.1  # damping is not late
-    found = (step[1] - step[0]) * doubts.TIMING * float(setup.fitter.simulator.windows.dt)
+    found = (step[1] - step[0]) * doubts.PRIORS.times * float(setup.fitter.simulator.windows.dt)
     assert found == pytest.approx(late, rel=0.25)
     assert pool.base.fit.values[0] < 1.01  # the damping takes the lag where there is no other number for it
     assert scored.found.posterior.middle[: len(scale)] == pytest.approx(scale, abs=0.01)

@@ -191,7 +191,7 @@ def test_a_single_survivor_is_sharpened():
     selection = contested.selection
     lonely = replace(contested, selection=replace(selection, state=replace(selection.state, models={})))
     found = propose(lonely, [], LIMITS)
-    assert "sharpens hinge.quadratic_drag.coefficient" in found.why
+    assert "divide the standard deviation of hinge.quadratic_drag.coefficient" in found.why
     assert found.evidence > 0.3 and found.pairs == []
 
 

@@ -23,7 +23,7 @@ def logged_late(logs):
 
 def estimated(robot, logs) -> Shift:
     size = scales.measure(robot.mj_model, [resample(log, PERIOD) for log in logs])
-    found = _shift(*_measured(robot.physics(PERIOD), logs, None, False), size)
+    found = _shift(*_measured(robot.physics(PERIOD), logs, group=None, use_qvel=False, limit=None), size)
     assert found is not None
     return found
 

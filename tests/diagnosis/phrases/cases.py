@@ -108,6 +108,7 @@ def every():
         "unexplained by chance": made("unexplained", flexible=NOTHING, not_tried=short),
         "partly": made("unexplained", [FRICTION], some, remains=0.2, flexible=FORCE),
         "nearest": made("unexplained", [GAIN], gap(with_effects=6.0), far_off=(3, 6)),
+        "little is closed": made("unexplained", [GAIN], gap(with_effects=8.0)),
         "beside joints that keep their speed": made("unexplained", [GAIN], gap(with_effects=6.0, coasting=5.0)),
         "known parameters": made("effects", [FRICTION], parameters=known, builds_up=3.0),
         "one parameter": made("effects", [FRICTION], parameters=few, efforts="the motors follow"),

@@ -1,10 +1,11 @@
 """The next experiment in words: sentences known beforehand."""
 
 from bayessim_mjx.diagnosis.phrases import experiment as phrases
+from bayessim_mjx.diagnosis.phrases.effects import all_of
 
 
 def test_why_an_experiment_is_proposed():
-    titles = [phrases.model_title(own) for own in ([("load_friction", "elbow"), ("payload", "all")], [], [("x", "y")])]
+    titles = [all_of(own) for own in ([("load_friction", "elbow"), ("payload", "all")], [], [("x", "y")])]
     assert titles == [
         "load-dependent friction at elbow and extra payload at all bodies",
         "the known parameters alone",
@@ -22,10 +23,10 @@ def test_why_an_experiment_is_proposed():
     assert text == f"{action}: confirms {titles[0]} against {titles[1]}, expected evidence 25 nats"
     text = phrases.separates_nobody(titles[:2], "release", 0.02, "more")
     assert text.endswith("(the best, release, is expected to give 0.0 nats); these would: more")
-    assert phrases.sharpens(action, "mass", 0.2, 0.05, "") == (
+    assert phrases.sharpens(action, "mass", 0.2, 0.05) == (
         f"{action}: it should divide the standard deviation of mass by 4"
     )
-    assert phrases.sharpens_little("release", "mass", 0.2, 0.16, "kg") == (
+    assert phrases.sharpens_little("release", "mass", 0.2, 0.16) == (
         "no experiment of the menu adds much; the best, release: it should divide the standard deviation of mass by 1.2"
     )
     assert phrases.separating(["unheard_of"]) == "a known payload, two mount orientations, or a measured effort"

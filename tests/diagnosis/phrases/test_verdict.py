@@ -73,11 +73,17 @@ def test_a_gap_within_the_noise_is_called_so():
     assert "with the effects" not in verdict.gap_line(LEVEL, False)
 
 
-@pytest.mark.parametrize("name", [v for v in VERDICTS if v != "insufficient_data"])
-@pytest.mark.parametrize("effects", [[], [FRICTION], [FRICTION, GAIN]])
-def test_every_verdict_is_a_sentence(name, effects):
-    if name in ("effects", "ambiguous") and not effects:
-        return  # nothing is named so without effects
+EVERY = [
+    (verdict, count)
+    for verdict in VERDICTS
+    for count in (0, 1, 2)
+    if verdict != "insufficient_data" and (count or verdict not in ("effects", "ambiguous"))
+]
+
+
+@pytest.mark.parametrize(("name", "count"), EVERY)
+def test_every_verdict_is_a_sentence(name, count):
+    effects = [FRICTION, GAIN][:count]
     for text in made(name, effects, remains=0.4).sentences:
         assert text[0].isupper() and text.endswith(".") and "{" not in text and "  " not in text
 
