@@ -26,7 +26,7 @@ class Rules:
     """The grids of the two covariances, and how much of the residuals they are held against.
 
     All of 8 cases with coloured noise and jitter are called noise, all of 8 unknown causes forces: the rule was made on
-    these. Counted on fresh unknown causes: none of 48 was called noise (c3b3eb0), one of 19 (3ed74ea). Play and an
+    these. Counted on fresh unknown causes: none of 48 was called noise (c3b3eb0), one of 19 (40adbad). Play and an
     elastic gear behind which the motor vibrates look like noise, too (2 of 2 there).
 
     Attributes:
