@@ -136,7 +136,7 @@ def terminal_picture(text: str, title: str, out: Path) -> None:
     for line in screen.texts():
         console.print(line, soft_wrap=True)
     console.print()  # the picture ends within its last line
-    svg = console.export_svg(title=f"python -m bayessim_mjx.{title}", theme=THEME, unique_id=out.stem)
+    svg = console.export_svg(title=f"bayessim-mjx {title}", theme=THEME, unique_id=out.stem)
     out.write_text(re.sub(r"@font-face {.*?}\s*", "", svg, flags=re.DOTALL))
 
 
