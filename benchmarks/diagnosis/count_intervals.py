@@ -50,6 +50,7 @@ import subprocess
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -123,28 +124,65 @@ def _write(path: Path, content: Any) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """All cases without a result, longest first, until the minutes are over."""
-    waiting, running = _waiting(args), dict[int | None, tuple[Any, Path, float]]()
-    until = time.monotonic() + 60 * args.minutes
-    usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-    free: list[int | None] = [*usable[: args.jobs]]
-    if args.case:  # somebody else shares the cores among such commands
-        free = [None]
+    waiting = _waiting(args)
+    # of one case, somebody else shares the cores among such commands
+    free = [None] if args.case else usable(args.jobs)
     print(f"{len(waiting)} cases, {len(free)} at once, {args.minutes:g} minutes", flush=True)
+    side_by_side(
+        waiting, free, args.minutes, lambda folder, core: _begin(folder, core, args), lambda f: _line(f, args.does)
+    )
+
+
+def usable(count: int) -> list[int | None]:
+    """At most so many cores of this process."""
+    own = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    return [*own[:count]]
+
+
+def side_by_side(
+    waiting: list[Path],
+    free: list[int | None],
+    minutes: float,
+    begin: Callable[[Path, int | None], "subprocess.Popen[bytes]"],
+    line: Callable[[Path], str],
+    ready: Callable[[Path], bool] = lambda folder: True,
+) -> None:
+    """A process for each folder, one on each free core, until the minutes are over; then running ones are killed.
+
+    Args:
+        line: what is printed when one has ended; ready: whether one may begin. It ends if none may and none runs.
+    """
+    running, until = dict[int | None, tuple[Any, Path, float]](), time.monotonic() + 60 * minutes
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that processes end with it
     try:
-        while (waiting or running) and time.monotonic() < until:
-            while waiting and free:
-                core, folder = free.pop(), waiting.pop(0)
-                running[core] = (_begin(folder, core, args), folder, time.monotonic())
+        while time.monotonic() < until:
+            now = [f for f in waiting if ready(f)]
+            if not running and not now:
+                break
+            while now and free:
+                core, folder = free.pop(), now.pop(0)
+                waiting.remove(folder)
+                running[core] = (begin(folder, core), folder, time.monotonic())
             for core, (process, folder, begun) in list(running.items()):
                 if process.poll() is not None:
                     del running[core]
                     free.append(core)
-                    print(f"{time.monotonic() - begun:4.0f} s {_line(folder, args.does)}", flush=True)
+                    print(f"{time.monotonic() - begun:4.0f} s {line(folder)}", flush=True)
             time.sleep(0.2)
     finally:
         for process, _, _ in running.values():
             os.killpg(process.pid, signal.SIGKILL)
-    print(f"the time is over: {len(running)} killed, {len(waiting)} not begun" if running or waiting else "all ended")
+    print(f"{len(running)} killed, {len(waiting)} not begun" if running or waiting else "all ended")
+
+
+def alone(command: list[str], output: Path, platforms: str = "cpu") -> "subprocess.Popen[bytes]":
+    """A process of one thread in a session of its own, which writes its output to a file."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {ALONE}".strip()
+    own = {"JAX_PLATFORMS": platforms, "XLA_FLAGS": flags, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | THREADS
+    with output.open("w") as text:
+        return subprocess.Popen(
+            command, stdout=text, stderr=subprocess.STDOUT, env=os.environ | own, start_new_session=True
+        )
 
 
 def _waiting(args: argparse.Namespace) -> list[Path]:
@@ -167,14 +205,9 @@ def _waiting(args: argparse.Namespace) -> list[Path]:
 
 
 def _begin(folder: Path, core: int | None, args: argparse.Namespace) -> "subprocess.Popen[bytes]":
-    flags = f"{os.environ.get('XLA_FLAGS', '')} {ALONE}".strip()
-    alone = {"JAX_PLATFORMS": args.platforms, "XLA_FLAGS": flags, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | THREADS
     command = [sys.executable, __file__, ONE[args.does], str(folder), f"--more={args.more}"]
     command += [] if core is None else ["--core", str(core)]
-    with (folder / ("output.txt" if args.does == "run" else "rivals.txt")).open("w") as text:
-        return subprocess.Popen(
-            command, stdout=text, stderr=subprocess.STDOUT, env=os.environ | alone, start_new_session=True
-        )
+    return alone(command, folder / ("output.txt" if args.does == "run" else "rivals.txt"), args.platforms)
 
 
 def _line(folder: Path, does: str) -> str:

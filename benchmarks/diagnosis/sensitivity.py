@@ -20,7 +20,6 @@ import importlib.util
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -29,7 +28,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from count_intervals import ALONE, PLAN, RESULT, SECONDS, THREADS
+from count_intervals import PLAN, RESULT, SECONDS, alone, side_by_side, usable
 
 ROOT = Path(__file__).parents[2]
 PACKAGE, OWN = "bayessim_mjx.diagnosis", "selection.numbers"
@@ -201,39 +200,15 @@ def run_name(number: str, word: str) -> str:
 def run(todo: Sequence[Path], workers: int, minutes: float) -> None:
     """All runs without a result, one core each, until the minutes are over."""
     waiting = [f for f in todo if not (f / RESULT).exists()]
-    usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-    free, running = usable[:workers], dict[int, tuple[Any, Path, float]]()
-    until = time.monotonic() + 60 * minutes
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that runs end with it
+    free = usable(workers)
     print(f"{len(waiting)} of {len(todo)} runs, {len(free)} at once, {minutes:g} minutes", flush=True)
-    try:
-        while time.monotonic() < until:
-            ready = [f for f in waiting if f.name == UNCHANGED or (f.parent / MADE).exists()]
-            if not running and not ready:  # all have ended, or their logs could not be made
-                break
-            while free and ready:
-                core, folder = free.pop(), ready.pop(0)
-                waiting.remove(folder)
-                running[core] = (_begin(folder, core), folder, time.monotonic())
-            for core, (process, folder, begun) in list(running.items()):
-                if process.poll() is not None:
-                    del running[core]
-                    free.append(core)
-                    print(f"{time.monotonic() - begun:4.0f} s {_line(folder)}", flush=True)
-            time.sleep(0.2)
-    finally:
-        for process, _, _ in running.values():
-            os.killpg(process.pid, signal.SIGKILL)
-    print(f"{len(running)} killed, {len(waiting)} not begun" if running or waiting else "all ended")
+    side_by_side(  # those of a case begin when its logs are there
+        waiting, free, minutes, _begin, _line, lambda f: f.name == UNCHANGED or (f.parent / MADE).exists()
+    )
 
 
-def _begin(folder: Path, core: int) -> "subprocess.Popen[bytes]":
-    own = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {ALONE}".strip()} | THREADS
-    command = [sys.executable, __file__, "--one", str(folder), "--core", str(core)]
-    with (folder / "output.txt").open("w") as text:
-        return subprocess.Popen(
-            command, stdout=text, stderr=subprocess.STDOUT, env=os.environ | own, start_new_session=True
-        )
+def _begin(folder: Path, core: int | None) -> "subprocess.Popen[bytes]":
+    return alone([sys.executable, __file__, "--one", str(folder), "--core", str(core)], folder / "output.txt")
 
 
 def _line(folder: Path) -> str:

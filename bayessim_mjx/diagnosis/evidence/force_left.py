@@ -28,7 +28,6 @@ from bayessim_mjx.diagnosis.evidence.gaussian import (
     Marginal,
     Windows,
     marginal,
-    windows_of,
 )
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
@@ -83,10 +82,9 @@ class ForceLeft:
 
 def of_set(weighing: Weighing, key: Key) -> ForceLeft:
     """The posterior of the force that a weighed set of effects leaves."""
-    found, spread = weighing.scored[key], weighing.state.fitter.spread
-    fit = found.fit
-    windows = windows_of(fit.r, fit.A, fit.B, weighing.D, fit.offsets, spread, weighing.scale, weighing.channels)
-    return force_left(windows, belief_of(fit), found.learnt, weighing.scale)
+    found = weighing.scored[key]
+    windows = weighing.windows(found.fit, found.fit.r)
+    return force_left(windows, belief_of(found.fit), found.learnt, weighing.scale)
 
 
 def force_left(windows: Windows, belief: Belief, learnt: Learnt, scale: Array) -> ForceLeft:
@@ -160,7 +158,7 @@ def _without(windows: Windows, belief: Belief, hyper: Hyper) -> float:
         along = np.concatenate([np.tile(one, (count, 1)), -there.mean @ one @ there.root.T], 1)
         outer = along[:, :, None] * along[:, None, :]
         outer[:, own:, own:] += there.root @ there.cov @ there.root.T
-        square = windows.gram.reshape(len(windows.gram), -1) @ outer.ravel()  # of what is left, expected
+        square = windows.gram.reshape(len(windows.gram), -1) @ outer.ravel()  # expected square of the residual
         last, hyper = value, replace(hyper, noise=np.sqrt(square / (windows.rows * count)))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.evidence import doubts
-from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, marginal, windows_of
+from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, Windows, learn, marginal, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import Integrated, Posterior, belief_of, integrated
 from bayessim_mjx.diagnosis.evidence.sets import Weighed, weighed
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
@@ -57,13 +56,18 @@ class Weighing:
         """With what simulators differ by as further numbers."""
         return doubts.doubted(fit, self._doubts)
 
+    def windows(self, fit: Fit, r: Array) -> Windows:
+        """The linear model about a fit, of residuals `[W, n]` at its values."""
+        spread = self.state.fitter.spread
+        return windows_of(r, fit.A, fit.B, self.D, fit.offsets, spread, self.scale, self.channels)
+
     def score(self, keys: Iterable[Key]) -> None:
         """Compute the evidence of fitted models, again where the fit has changed."""
         for key in keys:
             model, old = self.state.models.get(key), self.scored.get(key)
             if model is not None and (old is None or old.model is not model):
-                fit, spread = self.doubted(model.fit), self.state.fitter.spread
-                own = windows_of(fit.r, fit.A, fit.B, self.D, fit.offsets, spread, self.scale, self.channels)
+                fit = self.doubted(model.fit)
+                own = self.windows(fit, fit.r)
                 learnt = learn(own, belief_of(fit), self._alike())
                 self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt, _numbers(model)))
 
@@ -180,7 +184,7 @@ def at_its_mean(weighing: Weighing, key: Key) -> Model:
         here = weighing.scored[key]
         mean, covariance = _own(here)
         mean = np.clip(mean, low, high)
-        # a move by d standard deviations is worth d^2 / 2 nats
+        # a move by d standard deviations changes the log density by d^2 / 2 nats
         if np.all((mean - here.model.fit.values) ** 2 <= 2 * EFFORT.tolerance * np.diag(covariance)):
             break
         moved = fitter.refresh(replace(here.model.fit, values=mean, history=()))
@@ -213,7 +217,11 @@ def estimated(weighing: Weighing, found: Weighed) -> Estimated:
         np.arange(len(sd)) < base, 0.0, mean - answer.model.fit.values
     )  # effects' numbers are those of the fit
     covariance = covariance + np.diag(away**2)
-    step = functools.partial(_step, weighing, answer)
+
+    def step(r: Array) -> Array:
+        there = marginal(weighing.windows(answer.fit, r), answer.learnt.hyper)
+        return belief_of(answer.fit).best(there.Q.sum(0))[: len(answer.model.fit.values)]
+
     above = np.maximum(answer.learnt.hyper.amplitude**2 - PRIORS.least**2, 0.0)  # less is there for any law
     size = weighing.scale * np.sqrt(above)
     covariance = covariance + doubts.covariance(weighing.state.fitter, weighing.D, size, step, answer.fit.r)
@@ -245,13 +253,6 @@ def size_in(of: Scored, effect: Candidate) -> Size:
     mean, covariance = _own(of)
     own = [of.model.fit.names.index(c.name) for c in effect.coordinates]
     return size_of(effect, mean[own], np.sqrt(np.diag(covariance)[own]))
-
-
-def _step(weighing: Weighing, of: Scored, r: Array) -> Array:
-    """The most probable step `[k]` of the model's numbers, of other residuals at their values."""
-    fit, sizes = of.fit, (weighing.state.fitter.spread, weighing.scale, weighing.channels)
-    there = marginal(windows_of(r, fit.A, fit.B, weighing.D, fit.offsets, *sizes), of.learnt.hyper)
-    return belief_of(fit).best(there.Q.sum(0))[: len(of.model.fit.values)]
 
 
 def _beside(of: Scored, base: int) -> Array:
