@@ -10,7 +10,7 @@ from typing import IO, Any
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike, mode: str = "wb", **options: Any) -> Iterator[IO]:
-    """A temporary file beside `path`, which takes its place when the block ends without an error.
+    """Open a temporary file beside `path`, which takes its place when the block ends without an error.
 
     Args:
         mode, options: as of `open`.

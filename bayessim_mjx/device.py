@@ -66,7 +66,7 @@ def _join(jax: Any) -> None:
 
 
 def mesh(config: Config) -> Any:
-    """The devices that share the worlds, by `config.devices`, as `rl.init` takes them; None: one. After `setup_jax`."""
+    """Make the mesh of `config.devices` that share the worlds, for `rl.init`; None: one device. After `setup_jax`."""
     import jax
 
     platform, _, number = config.device.partition(":")
@@ -84,7 +84,7 @@ def mesh(config: Config) -> Any:
 
 
 def mesh_of(devices: Sequence[Any]) -> Any:
-    """The mesh of these devices; None for one."""
+    """Make the mesh of these devices; None for one."""
     import jax
     import numpy as np
     from jax.sharding import Mesh
@@ -121,7 +121,7 @@ def _collect_rarely() -> None:
 
 
 def on_cores(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """`function` of each item, in order, on as many threads as there are cores: for what leaves Python's lock."""
+    """Call `function` on each item, results in order, on as many threads as cores: for work outside Python's lock."""
     with ThreadPoolExecutor(cores()) as pool:
         return list(pool.map(function, items))
 

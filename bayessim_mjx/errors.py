@@ -27,7 +27,7 @@ def nearest(given: str, names: Iterable[str], n: int = 3, cutoff: float = 0.6) -
 
 
 def unknown(what: str, given: str, allowed: Iterable[str], page: str = "") -> UserError:
-    """The error for a name that does not exist: the close ones first; then all, or of many the page that lists them."""
+    """Make the error for an unknown name: close ones first; then all, or of many the page that lists them."""
     names = list(allowed)
     last = {n.rpartition(".")[2].lower(): n for n in names}
     close = [last[n] for n in nearest(given.rpartition(".")[2].lower(), last)]

@@ -46,7 +46,7 @@ class BraxEnv(Env):
         return inner
 
     def _after(self, inner: Any) -> Any:
-        """What is carried on of its state."""
+        """Return the part of its state that is carried on."""
         return inner
 
     def _state(self, inner: Any, steps: jax.Array) -> State:
@@ -130,7 +130,7 @@ def make(name: str, *, config: "Config | None" = None, **overrides: Any) -> Brax
 
 
 def make_brax(name: str, episode_length: int | None = None) -> BraxEnv:
-    """The Brax environment `name` on MJX, episodes of 1000 steps by default."""
+    """Make the Brax environment `name` on MJX, episodes of 1000 steps by default."""
     from brax import envs
 
     _known(name, list(envs._envs), "brax")
@@ -138,7 +138,7 @@ def make_brax(name: str, episode_length: int | None = None) -> BraxEnv:
 
 
 def make_playground(name: str, episode_length: int | None = None, warp: bool = False) -> BraxEnv:
-    """The Playground environment `name` with its default settings, on MJX's JAX implementation or MuJoCo Warp."""
+    """Make the Playground environment `name` at its default settings, on MJX's JAX implementation or MuJoCo Warp."""
     try:
         from mujoco_playground import registry
     except ImportError as error:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 
 def wrap(angle: jax.Array) -> jax.Array:
-    """The angle in (-pi, pi], rad."""
+    """Wrap the angle to (-pi, pi], rad."""
     return jnp.pi - jnp.mod(jnp.pi - angle, 2 * jnp.pi)
 
 
@@ -22,16 +22,16 @@ def rotation(quat: jax.Array) -> jax.Array:
 
 
 def product(one: jax.Array, two: jax.Array) -> jax.Array:
-    """The quaternion `[4]` of the rotation `two` followed by `one`."""
+    """Multiply quaternions `[4]`: the rotation `two` followed by `one`."""
     w, v, x, u = one[0], one[1:], two[0], two[1:]
     return jnp.concatenate([jnp.array([w * x - v @ u]), w * u + x * v + jnp.cross(v, u)])
 
 
 def conjugate(quat: jax.Array) -> jax.Array:
-    """The quaternion `[4]` of the rotation back."""
+    """Invert a rotation given as a quaternion `[4]`."""
     return quat * jnp.array([1.0, -1.0, -1.0, -1.0])
 
 
 def xyzw(quat: jax.Array) -> jax.Array:
-    """A quaternion `[4]` in Isaac Gym's order."""
+    """Reorder a quaternion `[4]` as Isaac Gym has it."""
     return jnp.roll(quat, -1)

@@ -99,7 +99,7 @@ def _reason(error: Exception) -> str:
 
 
 def _speed(config: "Config", impl: str, worlds: int, seconds: float) -> "Speed | str":
-    """The speed of one implementation, or why there is none."""
+    """Measure the speed of one implementation, or say why there is none."""
     from bayessim_mjx import registry
     from bayessim_mjx.rl import speed
 
@@ -186,7 +186,7 @@ def _quiet() -> None:
 
 
 def _conclusion(config: "Config", console: "Console", kept: bool) -> None:
-    """What auto takes from now on, where that stands, and what else changes with it."""
+    """Print what auto takes from now on, where that is stored, and what else changes with it."""
     from bayessim_mjx import registry
     from bayessim_mjx.physics import implementation, measured
     from bayessim_mjx.physics.warp import LEAST_ITERATIONS

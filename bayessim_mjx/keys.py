@@ -12,7 +12,7 @@ GOLDEN = np.uint32(2654435769)  # 2^32 / golden ratio: multiples of it are sprea
 
 
 def branch(key: Array, number: int | Array) -> Array:
-    """A key for a purpose of its own, beside those that `jax.random.split(key, n)` gives.
+    """Make a key for a purpose of its own, beside those that `jax.random.split(key, n)` gives.
 
     `jax.random.fold_in(key, i)` is the i-th of those: what both are used for would be drawn alike.
     """

@@ -18,7 +18,7 @@ RIDGE = 1e-3  # of the features' variance; source: rule of thumb, not counted
 
 
 def product(a: Array, b: Array) -> Array:
-    """a @ b in full float32, also where a GPU would round its inputs to TF32."""
+    """Compute a @ b in full float32, also where a GPU would round its inputs to TF32."""
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
 
 

@@ -268,7 +268,7 @@ def joints_by_side(model: mujoco.MjModel, sides: tuple[str, str], normal: str = 
 
 
 def resolve(mirror: Mirror, model: mujoco.MjModel, groups: Mapping[str, Sequence[str]]) -> MirrorMap:
-    """The maps that `mirror` means for this model and the observations called `groups[group]`; UserError."""
+    """Find the maps that `mirror` means for this model and the observations called `groups[group]`; UserError."""
     known = {name for names in groups.values() for name in names}
     for name, text in mirror.observations.items():
         if unknown := {name, image(text)[0]} - known:

@@ -19,12 +19,12 @@ def is_file(task: str) -> bool:
 
 
 def short(task: str) -> str:
-    """A task's name for folders and titles: `Slider` of `path/slider.py:Slider`."""
+    """Shorten a task's name for folders and titles: `Slider` of `path/slider.py:Slider`."""
     return task.rpartition(":")[2] if is_file(task) else task
 
 
 def settings_beside(task: str) -> Path | None:
-    """The YAML file of a task outside of the library: `slider.yaml` beside `slider.py`; it need not exist.
+    """Find the YAML file of a task outside of the library: `slider.yaml` beside `slider.py`; it need not exist.
 
     None: no such task is known.
     """

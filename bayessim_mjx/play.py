@@ -51,7 +51,7 @@ def _parser() -> cli.Parser:
 
 
 def _settings(args: argparse.Namespace) -> tuple[Config, Path, Any]:
-    """(settings of the run that the checkpoint belongs to with flags on top, checkpoint folder, run or None)."""
+    """Load (settings of the checkpoint's run with flags on top, checkpoint folder, run or None)."""
     if args.task:
         args.task = cli.task_name(args.task)
     if args.use_pretrained_checkpoint:
@@ -69,7 +69,7 @@ def _settings(args: argparse.Namespace) -> tuple[Config, Path, Any]:
 
 
 def _pretrained_settings(args: argparse.Namespace) -> tuple[Config, Path, None]:
-    """The same for the policy that comes with the package; the folder is where its videos and exports go beside."""
+    """Load the same for the policy that comes with the package; its videos and exports go beside the folder."""
     from bayessim_mjx.rl import pretrained
 
     flag, have = "--use_pretrained_checkpoint", ", ".join(pretrained.names())
@@ -176,14 +176,14 @@ def _play(argv: Sequence[str] | None) -> int:
 
 
 def _acted_in(config: Config, run: Any) -> Any:
-    """The environment as the policy of `run` sees it."""
+    """Wrap the environment as the policy of `run` sees it."""
     from bayessim_mjx import registry
 
     return cli.privileged(replace(config, ppo={"teacher": None}), registry.make(config.task, config=config), run)[0]
 
 
 def _policy(args: argparse.Namespace, config: Config, path: Path, env: Any) -> Any:
-    """The policy of the checkpoint, or that which comes with the package."""
+    """Load the policy of the checkpoint, or that which comes with the package."""
     if not args.use_pretrained_checkpoint:
         return cli.load_policy(path, env, config)
     from bayessim_mjx.rl import groups, pretrained
@@ -198,7 +198,7 @@ def _policy(args: argparse.Namespace, config: Config, path: Path, env: Any) -> A
 
 
 def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count: int, console: Any) -> int:
-    """The table of returns, and the video."""
+    """Show the table of returns, and the video."""
     setup_jax(config)
     import jax
 

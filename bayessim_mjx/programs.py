@@ -83,7 +83,7 @@ class Kept:
 
 
 def traced_from(physics: Physics, *more: Any) -> str | None:
-    """What a program of a physics is traced from; None where it cannot be told: of effects without a source file."""
+    """Describe what a program of a physics is traced from; None for effects without a source file."""
     size = mujoco.mj_sizeModel(physics.mj_model)
     model = np.empty(size, np.uint8)
     mujoco.mj_saveModel(physics.mj_model, None, model)

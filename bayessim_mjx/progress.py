@@ -22,7 +22,7 @@ class Show(Protocol):
         """`done` of `total` parts of a stage are done; `note`: a result so far."""
 
     def line(self, text: str) -> None:
-        """A result that stays on the screen."""
+        """Print a result that stays on the screen."""
 
 
 Wanted = bool | Callable[..., Any] | None  # an argument `progress`

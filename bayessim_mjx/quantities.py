@@ -20,12 +20,12 @@ EXACT = 1e-6  # an uncertainty below this share of the value is not shown
 
 
 def finite(value: Any) -> TypeGuard[float]:
-    """A number that can be shown; None, NaN, infinities and text cannot."""
+    """Tell whether x is a number that can be shown; None, NaN, infinities and text cannot."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def is_number(value: Any) -> bool:
-    """A number that can be told: also a scalar of NumPy or JAX, and an infinity, but no NaN and no text."""
+    """Tell whether x is a number: also a scalar of NumPy or JAX, and an infinity, but no NaN and no text."""
     try:
         return value is not None and not isinstance(value, str) and not math.isnan(float(value))
     except (TypeError, ValueError):
@@ -33,7 +33,7 @@ def is_number(value: Any) -> bool:
 
 
 def power(value: float) -> int:
-    """The exponent of the first digit: 0.031 -> -2."""
+    """Compute the exponent of the first digit: 0.031 -> -2."""
     return math.floor(math.log10(abs(value))) if value else 0
 
 
@@ -72,7 +72,7 @@ def compact(value: Any, digits: int = 4) -> str:
 
 
 def percent(share: Any, sign: bool = False) -> str:
-    """A share in per cent: whole from 10 % on, two digits below; 99.5 to 99.9 % with a decimal, as they are not all."""
+    """Write a share in per cent: whole from 10 % on, two digits below; 99.5 to 99.9 % with a decimal, as not all."""
     if not finite(share := float(share) if _is_float(share) else share):
         return MISSING
     size = abs(share)
@@ -134,7 +134,7 @@ def count(n: int, thing: str) -> str:
 
 
 def listed(names: Sequence[str], last: str = "and", most: int | None = None) -> str:
-    """`a, b and c`; where there are more than `most`, the first and how many more: `a, b and 5 more`."""
+    """Join `a, b and c`; where there are more than `most`, the first and how many more: `a, b and 5 more`."""
     some, more = list(names[:most]), len(names) - len(names[:most])
     some += [f"{more} more"] if more else []
     return f" {last} ".join([", ".join(some[:-1]), some[-1]]) if len(some) > 1 else "".join(some)
@@ -165,12 +165,12 @@ def unit(text: str) -> str:
 
 
 def typeset(text: str) -> str:
-    """A number as it is printed on a page: with a minus sign in place of a hyphen."""
+    """Typeset a number for a page: with a minus sign in place of a hyphen."""
     return text.replace("-", "−")
 
 
 def ascii_of(text: str) -> str:
-    """The nearest text of ASCII characters: `(1.2 ± 0.3)·10⁻⁶` -> `(1.2 +/- 0.3)*10^-6`."""
+    """Write the nearest text of ASCII characters: `(1.2 ± 0.3)·10⁻⁶` -> `(1.2 +/- 0.3)*10^-6`."""
     for sign, words in (("±", "+/-"), ("…", "..."), ("–", "-"), ("−", "-"), ("·", "*"), ("×", "x"), ("─", "-")):
         text = text.replace(sign, words)
     text = re.sub("[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda found: "^" + found[0].translate(PLAIN_DIGITS), text)

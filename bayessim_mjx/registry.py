@@ -28,7 +28,7 @@ EXTERNAL = ("brax", "playground")
 
 
 def make(name: str, *, config: "Config | None" = None, effects: "Sequence[Effect]" = (), **env_overrides: Any) -> "Env":
-    """The environment called `name`, at the task's defaults where neither `config` nor an override says otherwise.
+    """Make the environment called `name`, at the task's defaults where neither `config` nor an override says otherwise.
 
     Args:
         name: a name from `names()` (case and underscores do not matter), "path/file.py:Class", "brax:<env>" or
@@ -67,7 +67,7 @@ def make(name: str, *, config: "Config | None" = None, effects: "Sequence[Effect
 
 
 def _listed(config: "Config") -> "tuple[Effect, ...]":
-    """The config's effects; on nominal physics those whose values are known, as the others are neutral there."""
+    """List the config's effects; on nominal physics those whose values are known, as the others are neutral there."""
     specs = config.effects
     if config.randomization.get("randomize") is False:
         specs = tuple(spec for spec in specs if spec.get("parameters"))
@@ -77,7 +77,7 @@ def _listed(config: "Config") -> "tuple[Effect, ...]":
 
 
 def class_of(name: str) -> Any:
-    """The class of a task of ours, of a file or of an installed package.
+    """Find the class of a task of ours, of a file or of an installed package.
 
     Raises:
         UserError: there is none; it is no task, or cannot be imported.
@@ -103,7 +103,7 @@ def class_of(name: str) -> Any:
 
 
 def proper(name: str, what: str) -> str:
-    """A task's name as `names()` has it; `what` says where it was given.
+    """Return a task's name as `names()` has it; `what` says where it was given.
 
     Raises:
         UserError: no such task, with the close names and all that are allowed.
@@ -120,7 +120,7 @@ NEEDED = {"control_dt": "s", "default_episode_length": "control steps", "observa
 
 
 def _checked(kind: Any, name: str) -> Any:
-    """The class, if it is a whole task."""
+    """Return the class, if it is a whole task."""
     from bayessim_mjx.env import Task
 
     if not (isinstance(kind, type) and issubclass(kind, Task)):
@@ -134,7 +134,7 @@ def _checked(kind: Any, name: str) -> Any:
 
 
 def _tried(name: str, kind: Any, given: tuple) -> "Env":
-    """The environment of a user's file, whose reset and step were traced once: an error names the file and line."""
+    """Make the environment of a user's file, its reset and step traced once: an error names the file and line."""
     import jax
 
     file = Path(name.rpartition(":")[0]).resolve()

@@ -104,7 +104,7 @@ def _gap(physics: Physics, world: Any, qpos: Array, qvel: Array) -> Array:
 
 
 def _drawn(physics: Physics, world: Any, by: Array) -> Any:
-    """The world moved by [2 nv] in position and velocity."""
+    """Move the world by [2 nv] in position and velocity."""
     nv = physics.mj_model.nv
     return world.replace(qpos=integrate(physics.mj_model, world.qpos, by[:nv]), qvel=world.qvel + by[nv:])
 

@@ -92,13 +92,13 @@ class Training:
         self.wall.close()
 
     def policy(self, state: Any) -> Any:
-        """The policy now."""
+        """Return the policy now."""
         from bayessim_mjx import rl
 
         return rl.policy_of(state)
 
     def tree(self, state: Any) -> dict[str, Any]:
-        """What a checkpoint holds."""
+        """Return what a checkpoint holds."""
         return {"policy": self.policy(state), "state": state}
 
     def progress(self, metrics: dict[str, Any], state: Any) -> None:
@@ -115,7 +115,7 @@ class Training:
             self.stop.save(lambda: self.save(state))
 
     def save(self, state: Any, evaluation: float | None = None) -> None:
-        """A checkpoint, with all that was written before it on the disk."""
+        """Save a checkpoint, with all that was written before it on the disk."""
         self.writer.flush()
         self.wall.flush()
         meta = {"iteration": int(state.iteration), "seconds": self.wall.mark()}
@@ -126,7 +126,7 @@ class Training:
         return max(1, self.config.monitor.video_interval // self.config.ppo.num_steps)
 
     def _video(self, iteration: int, state: Any) -> None:
-        """An episode at nominal physics every `monitor.video_interval` steps, and at the end."""
+        """Film an episode at nominal physics every `monitor.video_interval` steps, and at the end."""
         from bayessim_mjx.monitor.film import FPS, frames
 
         every, last = self._film_every(), iteration >= self.config.ppo.max_iterations
@@ -208,7 +208,7 @@ class AgentTraining(Training):
         return self.run.path / "agent" / str(iteration)
 
     def save(self, state: Any, evaluation: float | None = None) -> None:
-        """A checkpoint, after the agent's own files; older ones go."""
+        """Save a checkpoint, after the agent's own files; older ones go."""
         from bayessim_mjx.wrappers.agents import folders
 
         folder = self._folder(state.iteration)

@@ -31,7 +31,7 @@ def check(file: Path, spec: str, what: str = "effect") -> None:
 
 
 def module_of(path: Path, title: str, what: str, package: str) -> ModuleType:
-    """The module that a user's file makes; one for each file as it is now, so that equal classes are equal.
+    """Import a user's file as a module; one for each file as it is now, so that equal classes are equal.
 
     Args:
         path: the file; title: the class that is wanted of it, for messages; what: "effect", "task".

@@ -82,7 +82,7 @@ OTHER = Amount("size", "", _take("size"))
 
 
 def amount_of(effect: str, parameters: Parameters) -> float:
-    """The number of a cause with these parameters."""
+    """Give the number of a cause with these parameters."""
     return float(AMOUNTS.get(effect, OTHER).of(parameters))
 
 

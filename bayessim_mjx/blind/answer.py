@@ -32,7 +32,7 @@ Pair = tuple[str, str, str, str]  # hidden effect and place, said effect and pla
 
 
 def answer(check: Check, outcomes: Sequence[Outcome], say: Say | None = None) -> Found:
-    """What is written to blind.json; without `say`, and so before the end, without look-alikes: they take long."""
+    """Make the contents of blind.json; without `say` (before the end) no look-alikes are searched: they take long."""
     own = bench(check)
     found = findings(outcomes, own, check.effects)
     found["lookalikes"] = lookalikes(check, own, outcomes, say) if say else []
@@ -85,7 +85,7 @@ def lookalikes(check: Check, own: Bench, outcomes: Sequence[Outcome], say: Say) 
 
 
 def _rival(o: Outcome, own: Bench) -> tuple[str, str] | None:
-    """What was said in the place of the truth, as a cause of the finer reality."""
+    """Find the effect that was named in the place of the truth, as a cause of the finer reality."""
     said = o.named()
     if not said or said[0]["name"] not in KNOWN:
         return None
@@ -97,7 +97,7 @@ def _rival(o: Outcome, own: Bench) -> tuple[str, str] | None:
 
 
 def _excitation(check: Check, own: Bench, cause: Any, pair: Pair) -> tuple[str, float]:
-    """The motion of the menu that parts a pair best, and by how many noises; "" where none parts it."""
+    """Choose the motion of the menu that parts a pair best, and by how many noises; "" where none parts it."""
     try:
         menu = motions(own.load, check.name, tuple(np.asarray(own.rig.sigma)))
     except UserError:  # a robot that no motion can be proposed for

@@ -66,14 +66,14 @@ def make(check: Check, bench: Bench, item: Item) -> None:
 
 
 def drawn(check: Check, bench: Bench, item: Item) -> tuple[dict[str, float], list[Cause], np.random.Generator]:
-    """(base parameters, the cause without its size, the generator of what is drawn after them) of a case."""
+    """Draw (base parameters, the cause without its size, the generator of what is drawn after them) of a case."""
     rng = np.random.default_rng((check.seed, item.index))
     base = data_sheet(bench.rig, check.accuracy, rng)
     return base, [CAUSES[item.effect](item.where, bench.scales, rng)] if item.effect else [], rng
 
 
 def again(check: Check, bench: Bench, item: Item, size: float) -> Cause:
-    """The cause that is hidden in a case."""
+    """Draw the hidden cause of a case again, at its size."""
     (cause,) = drawn(check, bench, item)[1]
     cause.size = size
     return cause
@@ -86,14 +86,14 @@ def data_sheet(rig: Rig, accuracy: float, rng: np.random.Generator) -> dict[str,
 
 
 def hidden(cause: Cause) -> dict[str, Any]:
-    """A cause as the truth of a case tells it."""
+    """Describe a cause as the truth of a case."""
     parameters = {k: float(v) for k, v in cause.parameters().items()}
     amount = amount_of(cause.name, parameters)
     return {"name": cause.name, "where": cause.where, "parameters": parameters, "size": cause.size, "amount": amount}
 
 
 def _moved(rig: Rig, base: dict[str, float], causes: list[Cause], seed: int) -> tuple[Plant, list[Run]]:
-    """The plant and all runs of it; a cause under which a long run does not stay finite is halved."""
+    """Move the plant in all runs, (plant, runs); a cause under which a long run does not stay finite is halved."""
     for _ in range(GIVE_UP + 1):
         plant = Plant(rig, base, causes)
         runs = [rig.record(plant, i, seed) for i in range(len(rig.labels))]

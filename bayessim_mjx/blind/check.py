@@ -22,7 +22,7 @@ OURS = "bayessim-mjx diagnose"  # the entry that is checked where none is named
 
 
 def unasked() -> tuple[str, ...]:
-    """What `diagnose` tries unasked: what is never tried is never found, and nothing is learnt from hiding it."""
+    """List what `diagnose` tries by default: other effects are never found, so hiding them teaches nothing."""
     return tuple(e for e in KNOWN if library.load(e).offered)
 
 
@@ -76,7 +76,7 @@ class Check:
         return self.task or Path(self.model).stem
 
     def given(self, index: int) -> Path:
-        """What a diagnosis of a case gets: logs."""
+        """Name the folder of the logs that a diagnosis of a case gets."""
         return self.folder / "cases" / f"{index:04d}" / "given"
 
     def answer(self, index: int) -> Path:
@@ -139,7 +139,7 @@ class Bench:
         return [(e, w) for e in UNKNOWN for w in places(self.rig, e, self.scales)]
 
     def joint(self, where: str) -> str:
-        """The joint of a place, or the place itself."""
+        """Find the joint of a place; a place without one is returned itself."""
         return self.scales.drives.get(where, where)
 
     def slide(self, effect: str, where: str) -> bool:
@@ -156,7 +156,7 @@ def loader(check: Check) -> Load:
 
 @lru_cache(maxsize=1)
 def bench(check: Check) -> Bench:
-    """The bench of a check; once in every process.
+    """Make the bench of a check; once in every process.
 
     Raises:
         UserError: what is wrong with model, logs or effects.

@@ -30,7 +30,7 @@ class _Beneath(ctypes.Structure):
 
 
 def _call(*words: object) -> int:
-    """A system call's answer.
+    """Make a system call and return its answer.
 
     Raises:
         OSError: it failed.

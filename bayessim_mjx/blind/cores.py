@@ -16,12 +16,12 @@ def allowed() -> list[int]:
 
 
 def shares(cores: Sequence[int], workers: int) -> list[list[int]]:
-    """The cores that each worker stays on; none where there is one worker, or fewer cores than workers: on all."""
+    """Share out cores to workers; none where there is one worker, or fewer cores than workers: each runs on all."""
     return _split(cores, workers) if 1 < workers <= len(cores) else [[] for _ in range(workers)]
 
 
 def lent(own: Sequence[Sequence[int]], busy: Collection[int]) -> dict[int, list[int]]:
-    """The cores of each worker with work: its own, and an even share of those whose workers have none."""
+    """Give each worker with work its own cores and an even share of those whose workers have none."""
     spare = [core for k, cores in enumerate(own) if k not in busy for core in cores]
     return {k: [*own[k], *more] for k, more in zip(sorted(busy), _split(spare, len(busy)), strict=True)}
 
@@ -62,12 +62,12 @@ class Cores:
         self._working, self._given = dict[int, int](), dict[int, list[int]]()
 
     def environment(self) -> dict[str, str]:
-        """What a worker has to find there so that it can use cores that it is lent later."""
+        """List the environment variables that a worker needs so that it can use cores lent to it later."""
         cores = sum(map(len, self.own))
         return {POOL: str(min(cores, MOST))} if cores else {}
 
     def working(self, worker: int, process: int | None) -> None:
-        """It has something to do from now on, in this process; None: it waits."""
+        """Mark a worker as busy in this process from now on; None: it waits."""
         if not any(self.own):
             return
         with self._lock:

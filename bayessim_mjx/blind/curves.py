@@ -76,7 +76,7 @@ class Belief:
         return p @ weight, *np.array(bands).T
 
     def draw(self, rng: np.random.Generator, share: float) -> float:
-        """A strength that one curve, drawn from what is known, finds in `share` of all cases."""
+        """Draw a curve from what is known and return the strength that it finds in `share` of all cases."""
         k = rng.choice(self.weight.size, p=self.weight.ravel() / self.weight.sum())
         slope, threshold = SLOPE[k // len(THRESHOLD)], THRESHOLD[k % len(THRESHOLD)]
         odds = share / (1 - LAPSE)
@@ -84,7 +84,7 @@ class Belief:
 
 
 def _bell(x: np.ndarray, middle: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Normal densities over the last axis `x`, normalised on the grid."""
+    """Compute normal densities over the last axis `x`, normalised on the grid."""
     density = np.exp(-0.5 * ((x - middle[..., None]) / sd[..., None]) ** 2)
     return density / density.sum(-1, keepdims=True)
 
@@ -144,7 +144,7 @@ class Curves:
         return log
 
     def of(self, effect: str, where: str) -> Belief:
-        """What is known of one effect at one place, also where it was never tried."""
+        """Give what is known of one effect at one place, also where it was never tried."""
         log = self._population
         if effect in self._evidence:
             log = log - np.log(np.maximum(np.tensordot(_SLOPES, self._evidence[effect], 1), 1e-290))

@@ -112,7 +112,7 @@ def pictures(found: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def svg(figure: Any) -> str:
-    """A figure as an SVG element whose letters are outlines, so that it looks the same everywhere."""
+    """Write a figure as an SVG element whose letters are outlines, so that it looks the same everywhere."""
     import matplotlib
 
     with matplotlib.rc_context({"svg.fonttype": "path", "svg.hashsalt": "blind"}):

@@ -21,7 +21,7 @@ Found = dict[str, Any]
 
 
 def findings(outcomes: Sequence[Outcome], own: Bench, effects: tuple[str, ...]) -> Found:
-    """The answer as it is written to blind.json."""
+    """Make the answer as it is written to blind.json."""
     curves = Curves(trials(outcomes))
     singles = [o for o in outcomes if o.kind == "single" and o.said]
     rows = [_threshold(g, curves, singles, own) for g in own.groups(effects)]
@@ -73,7 +73,7 @@ def _threshold(group: tuple[str, str], curves: Curves, singles: Sequence[Outcome
 
 
 def amount_at(strength: float, pairs: Sequence[tuple[float, float]]) -> float:
-    """The amount of an effect of some strength, by a power law through (strength, amount) of its cases."""
+    """Convert a strength of an effect to its amount, by a power law through (strength, amount) of its cases."""
     x, y = np.log(np.array(pairs, float)).T
     power = 1.0
     if len(x) > 1 and np.ptp(x) > 0.7:
@@ -140,7 +140,7 @@ def _confusion(outcomes: Sequence[Outcome]) -> Found:
 
 
 def sentences(found: Found, most: int = 6) -> list[str]:
-    """What would not have been seen, the clearest first: for the report of a diagnosis of the same logs."""
+    """Write the effects that would have been missed, clearest first, for the report of a diagnosis of the same logs."""
     rows = [r for r in found["thresholds"] if r["amount"] and r["tried"]]
     rows.sort(key=lambda r: math.log(r["strength"][2] / r["strength"][1]))
     sharp = [r for r in rows[:most] if r["strength"][2] < SHARP * r["strength"][1]]

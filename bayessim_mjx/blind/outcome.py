@@ -103,7 +103,7 @@ def covered(outcome: Outcome) -> list[bool]:
 
 
 def label(outcome: Outcome) -> str:
-    """The first effect named, else the verdict."""
+    """Name the first effect found, else the verdict."""
     if not outcome.said:
         return "no result"
     return outcome.named()[0]["name"] if outcome.named() else str(outcome.said["verdict"])

@@ -23,7 +23,7 @@ RANGE = (0.5, 500.0)  # encoder noises, of all rounds
 
 
 def rounds(cases: int) -> list[range]:
-    """Indices of the cases of each round."""
+    """Split the indices of the cases into rounds."""
     starts = [0, *range(FIRST, cases, ROUND)]
     return [range(a, min(b, cases)) for a, b in zip(starts, [*starts[1:], cases], strict=True)]
 
@@ -37,7 +37,7 @@ def known(own: range) -> int:
 def plan(
     own: range, groups: Sequence[Group], unknown: Sequence[Group], trials: Sequence[Trial], seed: int
 ) -> list[Item]:
-    """The items of a round.
+    """Make the items of a round.
 
     Args:
         own: indices of its cases; groups, unknown: (effect, place) of what may be hidden, and of what no library has.

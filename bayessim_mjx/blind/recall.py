@@ -21,7 +21,7 @@ class Missed:
 
 
 def recall(folder: str | Path) -> Missed:
-    """The check in a folder.
+    """Read the check in a folder.
 
     Raises:
         UserError: there is none.
@@ -34,7 +34,7 @@ def recall(folder: str | Path) -> Missed:
 
 
 def beside(data: Sequence[str]) -> Missed | None:
-    """The check of these very logs that lies in a folder `blind` beside them, if there is one."""
+    """Read the check of these very logs that lies in a folder `blind` beside them; None: there is none."""
     wanted = {Path(p).resolve() for p in data}
     for folder in {Path(p).resolve().parent / FOLDER for p in data}:
         try:

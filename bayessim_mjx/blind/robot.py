@@ -25,7 +25,7 @@ Load = Callable[[], mujoco.MjSpec]
 
 
 def load_model(path: Path) -> mujoco.MjSpec:
-    """The MJCF file as a specification in which every element has a name, and no keyframe of another size is left.
+    """Load the MJCF file as a specification whose elements all have names, without keyframes of another size.
 
     Raises:
         UserError: there is no such file, or MuJoCo cannot load it.
@@ -39,7 +39,7 @@ def load_model(path: Path) -> mujoco.MjSpec:
 
 
 def load_task(name: str) -> Load:
-    """The model of one of our tasks, anew with every call.
+    """Load the model of one of our tasks, anew with every call.
 
     Raises:
         UserError: no such task, or it has no MuJoCo model of ours.
@@ -67,7 +67,7 @@ def _named(spec: mujoco.MjSpec) -> mujoco.MjSpec:
 
 
 def rig_of_logs(load: Load, paths: Sequence[str], name: str, log_map: str | None = None) -> tuple[Replay, list[Log]]:
-    """A rig that repeats logs, and the logs.
+    """Make a rig that repeats logs, and return it with the logs.
 
     Raises:
         UserError: what is wrong with a log; logs whose commands go through a controller of the log's own, or with
@@ -109,7 +109,7 @@ def _take(log: Log) -> Take:
 
 
 def _base(model: mujoco.MjModel) -> str:
-    """The body that stands on the ground and carries moving ones, "" where the world itself does."""
+    """Name the body that stands on the ground and carries moving ones, "" where the world itself does."""
     moving = [i for i in range(1, model.nbody) if model.body_weldid[i] == i and model.body_weldid[i] != 0]
     under = [int(model.body_parentid[i]) for i in moving if int(model.body_weldid[model.body_parentid[i]]) == 0]
     names = [model.body(i).name for i in under if i != 0]
@@ -117,13 +117,13 @@ def _base(model: mujoco.MjModel) -> str:
 
 
 def _stands(model: mujoco.MjModel) -> bool:
-    """A robot without a free base, in gravity, that a tilt of the ground is felt by."""
+    """Tell whether the robot has no free base and feels a tilt of the ground through gravity."""
     floats = (model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).any()
     return bool(not floats and np.linalg.norm(model.opt.gravity) > 0)
 
 
 def rig_of_menu(load: Load, name: str) -> System:
-    """A rig that is moved through triangles, multisines, chirps and steps within the model's ranges.
+    """Make a rig that moves in triangles, multisines, chirps and steps within the model's ranges.
 
     Raises:
         UserError: a robot whose motion cannot be proposed: it floats, mixes servos with torques, or a drive has no
@@ -154,7 +154,7 @@ def rig_of_menu(load: Load, name: str) -> System:
 
 
 def short(rig: Rig) -> Rig:
-    """The rig by which strengths are measured: the first seconds of long logs."""
+    """Shorten the rig to the first seconds of long logs, by which strengths are measured."""
     return rig.shortened() if isinstance(rig, Replay) else rig
 
 

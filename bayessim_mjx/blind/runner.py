@@ -160,7 +160,7 @@ class _Worker:
         answers.put({"idle": True})
 
     def _next(self, todo: Any) -> Any:
-        """What is to be done next; while there is nothing, its cores go to those that have something."""
+        """Take the next item; while there is none, its cores go to the workers that have one."""
         if todo.empty():
             self.cores.working(self.number, None)
         item = todo.get()
@@ -180,7 +180,7 @@ class _Worker:
 
 
 def outcomes(check: Check, indices: range, own: Bench) -> list[Outcome]:
-    """The finished cases, their seals opened.
+    """Collect the finished cases, their seals opened.
 
     Raises:
         UserError: a seal is broken.

@@ -32,7 +32,7 @@ def close(truth: Mapping[str, Any], given: Path, secret: Path) -> str:
 
 
 def opened(given: Path, secret: Path, seals: Mapping[str, str]) -> dict[str, Any]:
-    """The truth behind a seal.
+    """Open the truth behind a seal.
 
     Args:
         given: the folder that a diagnosis got; secret: the file of the truth.

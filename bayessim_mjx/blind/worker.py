@@ -31,7 +31,7 @@ EXIT = "exit.json"
 
 
 def command(check: Check, data: Path, out: Path) -> list[str]:
-    """The command of an entry: `{model}`, `{data}` and `{out}` in it are replaced and nothing else, or ours."""
+    """Build the command of an entry (only `{model}`, `{data}` and `{out}` are replaced), or ours without one."""
     model = str(Path(check.model).resolve()) if check.model else str(data.parent / "model.xml")
     if check.command:
         words = shlex.split(check.command)
@@ -73,8 +73,8 @@ def diagnose(check: Check, index: int) -> str:
 
 
 def really_closed(check: Check, index: int) -> float | None:
-    """What a diagnosis closes of the gap in the finer reality; None where it names nothing that can be put there, or
-    tells none of the known parameters.
+    """Compute the share of the gap in the finer reality that a diagnosis closes; None where it names nothing
+    that can be put there, or gives no known parameter.
     """
     answer = next((p for p in (check.answer(index) / n for n in KEPT) if p.exists()), None)
     said = json.loads(answer.read_text()) if answer else {}
@@ -121,7 +121,7 @@ def main() -> int:
 
 
 def asked(check: Check) -> str:
-    """The first line for a worker."""
+    """Write the first line for a worker."""
     return json.dumps(dataclasses.asdict(check))
 
 

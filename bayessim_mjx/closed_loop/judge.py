@@ -70,7 +70,7 @@ class Simulators:
 
 
 def wide(space: ParameterSpace) -> ParameterSpace:
-    """The known parameters, uniform within +-50 % of their nominal values (in their own ranges where those are 0)."""
+    """Make the known parameters uniform within +-50 % of nominal values (in their own ranges where those are 0)."""
     return ParameterSpace(_wide(p) for p in space.parameters)
 
 
@@ -119,7 +119,7 @@ class Judge:
     key: jax.Array
 
     def returns(self, env: Task, plans: Sequence[Plan]) -> list[Array]:
-        """Returns `[episodes]` of each plan: many in one program, which is compiled once for an environment."""
+        """Compute returns `[episodes]` of each plan: many in one program, which is compiled once for an environment."""
         out: dict[int, Array] = {}
         most = TOGETHER if jax.default_backend() == "cpu" else ON_ACCELERATORS
         for alike in _alike(plans):
@@ -179,7 +179,7 @@ class Judge:
 
 
 def _alike(plans: Sequence[Plan]) -> list[list[int]]:
-    """Indices of the plans, by networks of the same form."""
+    """Group the indices of the plans by networks of the same form."""
     groups: dict[Any, list[int]] = {}
     for i, (policy, _) in enumerate(plans):
         leaves, form = jax.tree.flatten(policy)
@@ -194,7 +194,7 @@ def places(physics: Physics) -> dict[tuple[str, str], NDArray[np.bool_]]:
 
 
 def replay(logs: Sequence[Log], nominal: Physics, corrected: Physics) -> dict[str, Any] | None:
-    """Declared controllers replayed in closed loop from the logs' first states: error of position, root mean square.
+    """Replay declared controllers in closed loop from the logs' first states; error of position, root mean square.
 
     Returns:
         {"seconds", "logs", "error": {dof: {"nominal", "corrected"}}} in rad or m; None where no log declares a law.

@@ -46,7 +46,7 @@ class Keeper:
         return self._trained(folder, role, seed, fingerprint, console)
 
     def fingerprint(self, role: str, seed: int) -> str:
-        """Changes with everything that the training depends on."""
+        """Hash everything that the training depends on."""
         env, domain = self.simulators.training(role)
         physics = env.physics
         fixed = [self.config.task, self.config.ppo.to_dict(), self.config.env.to_dict(), self.config.seed + seed]

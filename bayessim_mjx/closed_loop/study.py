@@ -34,7 +34,7 @@ EFFECTS = "effects.yaml"
 
 
 def loaded(folder: Path) -> result.Diagnosis:
-    """The diagnosis of a folder; a damaged one is a UserError."""
+    """Load the diagnosis of a folder; a damaged one is a UserError."""
     try:
         return result.load(folder)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -42,7 +42,7 @@ def loaded(folder: Path) -> result.Diagnosis:
 
 
 def correction(diagnosis: result.Diagnosis, folder: Path, known: ParameterSpace) -> storage.Correction:
-    """What a diagnosis found: its effects.yaml, or else its diagnosis.json on these known parameters.
+    """Read the correction of a diagnosis: effects.yaml, or else diagnosis.json on these known parameters.
 
     Raises:
         UserError: a file is damaged, or nothing was found.
@@ -55,20 +55,20 @@ def correction(diagnosis: result.Diagnosis, folder: Path, known: ParameterSpace)
 
 
 def nominal_task(config: Config) -> Any:
-    """The task at its model's own physics."""
+    """Make the task at its model's own physics."""
     plain = dataclasses.replace(config, randomization=freeze({"randomize": False}))
     return registry.make(config.task, config=plain)
 
 
 def _on(config: Config, physics: Physics) -> Any:
-    """The task on other physics; a fresh one, since compiled programs are kept by environment."""
+    """Put the task on other physics; a fresh one, since compiled programs are kept by environment."""
     env = nominal_task(config)
     env.physics = physics
     return env
 
 
 def _refined(body: robot.Robot, timestep: float | None, flag: str) -> robot.Robot:
-    """The robot at another time step, s; None: at its own."""
+    """Give the robot another time step, s; None: it keeps its own."""
     most = float(body.mj_model.opt.timestep)
     if timestep is None:
         return body
@@ -96,7 +96,7 @@ def _corrected(body: robot.Robot, dt: float, found: storage.Correction, source: 
 
 
 def surrogate(config: Config, file: str | Path, body: robot.Robot | None = None, timestep: float | None = None) -> Any:
-    """The task on a stand-in for the real system.
+    """Put the task on a stand-in for the real system.
 
     Args:
         file: its truth as an effects.yaml, hidden values as nominal ones.
@@ -131,7 +131,7 @@ class Study:
     logs: tuple[Log, ...]
 
     def opening(self) -> dict[str, Any]:
-        """What is about to run, for a person."""
+        """Describe, for a person, what is about to run."""
         s, ppo = self.simulators, self.config.ppo
         steps = ppo.max_iterations * ppo.num_steps * ppo.num_envs
         roles = [r for r in s.roles if not (r == "nominal" and self.given)]
@@ -169,7 +169,7 @@ class Study:
     # ---- results
 
     def run(self, console: Any) -> dict[str, Any]:
-        """The contents of gap_loop.json."""
+        """Run the study and return the contents of gap_loop.json."""
         policies = self.all_policies(console)
         console.say(f"the best policy of each training, {self.judge.episodes} episodes where it was trained ...")
         best = {role: self.chosen(role, each) for role, each in policies.items()}
@@ -198,7 +198,7 @@ class Study:
         return out
 
     def _relevance(self, policies: dict, best: dict, rows: dict) -> list[dict[str, Any]]:
-        """What each effect changes, for the first policy before and after retraining."""
+        """Measure what each effect changes, for the first policy before and after retraining."""
         first = {role: policies[role][0][best[role][0]] for role in ("nominal", "corrected")}
         cost = float(np.mean(rows["nominal"][0]["nominal"] - rows["nominal"][0]["corrected"]))
         before, after = self.judge.one_by_one([first["nominal"], first["corrected"]])
@@ -274,7 +274,7 @@ def make(args: argparse.Namespace, config: Config) -> Study:
 
 
 def _given(args: argparse.Namespace, config: Config, env: Any) -> Policies | None:
-    """The policies of --checkpoint: all checkpoints of a run, or the one."""
+    """Load the policies of --checkpoint: all checkpoints of a run, or the one."""
     if not args.checkpoint:
         return None
     path, run = cli.find_checkpoint(args.checkpoint, config.task, "logs")

@@ -26,7 +26,7 @@ def mean_return(found: Mapping[str, Any], role: str, simulator: str) -> float:
 
 
 def sentences(found: Mapping[str, Any]) -> list[str]:
-    """The findings, most important first."""
+    """Write the findings, most important first."""
     out = [_prediction(found)]
     if found["recovery"]:
         out += [_recovery(found["recovery"]), _ranking(found["ranking"])]

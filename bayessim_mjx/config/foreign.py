@@ -39,7 +39,7 @@ def note(raw: Mapping[str, Any], source: str, ours: Collection[str] = (), more: 
 
 
 def without(raw: Mapping[str, Any], ours: Collection[str]) -> dict[str, Any]:
-    """The file's sections without these keys."""
+    """Return the file's sections without these keys."""
     left = {key: value for key, value in raw.items() if key not in TOP}
     if isinstance(left.get("env"), Mapping):
         left["env"] = {k: v for k, v in left["env"].items() if k not in ENV or k in ours}
@@ -49,7 +49,7 @@ def without(raw: Mapping[str, Any], ours: Collection[str]) -> dict[str, Any]:
 
 
 def _plain(section: Any) -> Any:
-    """A section of `task:` without them."""
+    """Return a section of `task:` without them."""
     if not isinstance(section, Mapping):
         return section
     passed = (*OF_PARAMETERS, LOOKS)

@@ -68,7 +68,7 @@ def _one_length(env: Mapping[str, Any], source: str) -> Mapping[str, Any]:
 
 
 def _with_effects(raw: Mapping[str, Any], source: str, is_file: bool) -> Mapping[str, Any]:
-    """The layer with the contents of its effects.yaml; effects without calibrated parameters replace those before."""
+    """Add the contents of the layer's effects.yaml; effects without calibrated parameters replace those before."""
     effects = raw.get("effects")
     if not is_file and isinstance(effects, list | tuple):  # named on the command line itself
         specs = [str(e.get("effect")) for e in effects if isinstance(e, Mapping)]
@@ -106,7 +106,7 @@ def _merge_section(
 
 
 def _subsection(cls: type[Section], key: str) -> type[Section] | None:
-    """The class of a setting that is a section of its own, such as ppo.rnd."""
+    """Find the class of a setting that is a section of its own, such as ppo.rnd."""
     options = (o for o in typing.get_args(typing.get_type_hints(cls)[key]) if isinstance(o, type))
     return next((o for o in options if issubclass(o, Section)), None)
 
@@ -140,7 +140,7 @@ def _field(cls: type[Section], key: str, value: Any, path: str, source: str) -> 
 
 
 def _like(value: Any, default: Any, path: str, source: str) -> Any:
-    """A task's own setting: of the type its cfg file has."""
+    """Convert a task's own setting to the type that its cfg file has."""
     if default is None or value is None:
         return value
     if isinstance(default, list):

@@ -24,7 +24,7 @@ DICT = "dict"  # the source of settings that are no file
 
 
 def cfg_folder() -> Path:
-    """The folder of task YAMLs: inside the package in a wheel, beside it in a checkout."""
+    """Find the folder of task YAMLs: inside the package in a wheel, beside it in a checkout."""
     package = Path(__file__).resolve().parents[1]
     return next((f for f in (package / "cfg", package.parent / "cfg") if f.is_dir()), package / "cfg")
 
@@ -45,7 +45,7 @@ def load(
     flags: Mapping[str, tuple[str, Any]] | None = None,
     overrides: Iterable[str] = (),
 ) -> Config:
-    """The configuration of `task` with all layers applied.
+    """Load the configuration of `task` with all layers applied.
 
     Args:
         task: its name; may be left out where `cfg_env` holds `task_name`.
@@ -69,7 +69,7 @@ def load(
 
 
 def from_dict(raw: Mapping[str, Any], task: str | None = None, source: str = DICT) -> Config:
-    """A Config from plain nested dicts with the YAML names (the inverse of `Config.to_dict`). `raw` is not changed."""
+    """Make a Config from plain nested dicts with the YAML names (inverse of `Config.to_dict`); `raw` is not changed."""
     task = task or raw.get("task_name")
     if not task:
         raise UserError(f"{source}: no task_name")
@@ -77,7 +77,7 @@ def from_dict(raw: Mapping[str, Any], task: str | None = None, source: str = DIC
 
 
 def replace(config: Config, **sections: Any) -> Config:
-    """A changed copy: `replace(config, ppo={"gamma": 0.9}, seed=3)`."""
+    """Return a changed copy: `replace(config, ppo={"gamma": 0.9}, seed=3)`."""
     changed = {
         k: dataclasses.replace(getattr(config, k), **v) if isinstance(getattr(config, k), Section) else v
         for k, v in sections.items()
@@ -86,7 +86,7 @@ def replace(config: Config, **sections: Any) -> Config:
 
 
 def _train_layer(path: str | Path) -> dict[str, Any]:
-    """A --cfg_train file: a `ppo:` section alone, its keys bare, or `policy:` and `learn:` as BayesSimIG's."""
+    """Read a --cfg_train file: a `ppo:` section alone, its keys bare, or `policy:` and `learn:` as BayesSimIG's."""
     raw = read_yaml(path)
     if rlpt.is_one(raw):
         return rlpt.read(raw, str(path))

@@ -59,11 +59,11 @@ class Names:
         return name in self.library or name in self._entries or name in self._installed()
 
     def ending(self, name: str) -> Any:
-        """What may follow that name."""
+        """Get what may follow that name."""
         return self.library[name] if name in self.library else self.entry(name).ending
 
     def entry(self, name: str) -> Any:
-        """The entry of that name; one of the library only after the room that defines it was imported.
+        """Get the entry of that name; one of the library exists only after the room that defines it was imported.
 
         Raises:
             UserError: an installed package that does not give what its entry point promises.
@@ -149,7 +149,7 @@ def summary_of(name: str, key: str = "summarizer") -> tuple[str, dict[str, int]]
 
 
 def summary_name(value: Any) -> Any:
-    """A summary's name in full: summary_corr of `corr`."""
+    """Expand a summary's name: summary_corr of `corr`."""
     return f"summary_{value}" if isinstance(value, str) and not value.startswith("summary_") else value
 
 

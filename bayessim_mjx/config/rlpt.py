@@ -47,7 +47,7 @@ def is_one(raw: Mapping[str, Any]) -> bool:
 
 
 def read(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """The file's settings under our names, nested; a warning names those that mean nothing here.
+    """Read the file's settings under our names, nested; a warning names those that mean nothing here.
 
     Raises:
         UserError: a key that is none of theirs, or a section that is none.
@@ -71,7 +71,7 @@ def read(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _keys(raw: Mapping[str, Any], section: str, source: str) -> Mapping[str, Any]:
-    """The keys of a section; those beside the sections for the empty name."""
+    """Return the keys of a section; for the empty name those beside the sections."""
     if section == TOP:
         return {key: value for key, value in raw.items() if key not in (POLICY, LEARN)}
     content = raw.get(section) or {}

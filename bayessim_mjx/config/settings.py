@@ -58,14 +58,14 @@ def freeze(value: Any) -> Any:
 
 
 def thaw(value: Any) -> Any:
-    """The inverse of `freeze`: plain dicts and lists, ready for YAML."""
+    """Invert `freeze`: plain dicts and lists, ready for YAML."""
     if isinstance(value, Mapping):
         return {k: thaw(v) for k, v in value.items()}
     return [thaw(v) for v in value] if isinstance(value, list | tuple) else value
 
 
 def setting(default: Any, doc: str, **limits: Any) -> Any:
-    """A field with its meaning and limits (`low`, `high`: inclusive; `above`: exclusive; `choices`).
+    """Declare a field with its meaning and limits (`low`, `high`: inclusive; `above`: exclusive; `choices`).
 
     Numbers are finite in any case.
     """
@@ -109,7 +109,7 @@ def _prefixed(prefix: str) -> Callable[[Any], Any]:
 
 
 def number(value: Any) -> float | None:
-    """A finite number, also one that YAML reads as text (1e-3); None: it is none. Only in the digits 0 to 9."""
+    """Read a finite number, also one that YAML reads as text (1e-3); None: it is none. Only in the digits 0 to 9."""
     if isinstance(value, bool) or not isinstance(value, int | float | str) or not str(value).isascii():
         return None
     try:
@@ -120,12 +120,12 @@ def number(value: Any) -> float | None:
 
 
 def _counted(value: Any) -> Any:
-    """A number where a text is meant."""
+    """Read a number where a text is meant."""
     return str(value) if type(value) is int else value
 
 
 def _absolute(value: Any) -> Any:
-    """A path, or paths, that mean the same from any folder; what is no text is left for the type check to refuse."""
+    """Make a path, or paths, absolute, so that they mean the same from any folder; the type check refuses non-texts."""
     if isinstance(value, list | tuple):
         return [_absolute(v) for v in value]
     return os.path.abspath(os.path.expanduser(value)) if isinstance(value, str) and value else value
@@ -234,7 +234,7 @@ class EnvConfig(Section):
         return self.options[key] if key in self.options else getattr(self, key)
 
     def get(self, key: str, default: Any = None) -> Any:
-        """The value of `key`, or `default` where it is absent or null."""
+        """Return the value of `key`, or `default` where it is absent or null."""
         value = self.options.get(key, getattr(self, key, None))
         return default if value is None else value
 

@@ -20,7 +20,7 @@ REFERENCE = re.compile(r"\$\{([^${}:\s]+)\}")
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """A YAML file as nested dicts; every way it can be broken is one UserError with file and line."""
+    """Read a YAML file as nested dicts; every way it can be broken is one UserError with file and line."""
     raw = _parsed(_text(path), str(path))
     if not isinstance(raw, dict):
         raise UserError(f"{path}: expected sections of `key: value` lines, found a {type(raw).__name__}")
@@ -45,7 +45,7 @@ def _text(path: str | Path) -> str:
 
 
 def read_value(text: str, source: str) -> Any:
-    """The value of a short YAML text, such as `[1, 2]`, on the command line.
+    """Read the value of a short YAML text, such as `[1, 2]`, on the command line.
 
     Raises:
         UserError: it is no YAML, or holds `${...}`, which only files may.
@@ -115,7 +115,7 @@ def _refuse_growth(root: Any, source: str) -> None:
 
 
 def _expanded(node: Any, root: Mapping[str, Any], source: str) -> Any:
-    """The values with references replaced by what they stand for."""
+    """Replace references in the values by what they stand for."""
     if isinstance(node, dict):
         for key in node:
             if isinstance(key, str) and "${" in key:
@@ -150,7 +150,7 @@ def _referred(text: str, root: Mapping[str, Any], source: str, chain: int) -> An
 
 
 def _at(root: Mapping[str, Any], path: str, source: str) -> Any:
-    """The number or text at `a.b.0`."""
+    """Get the number or text at `a.b.0`."""
     node: Any = root
     for part in path.split("."):
         if isinstance(node, list) and re.fullmatch("[0-9]{1,9}", part) and int(part) < len(node):

@@ -34,12 +34,12 @@ def names() -> list[str]:
 
 @functools.cache
 def _library() -> tuple[str, ...]:
-    """The files of this folder that define an effect of their name; the others are helpers."""
+    """List the files of this folder that define an effect of their name; the others are helpers."""
     return tuple(m.name for m in pkgutil.iter_modules(__path__) if _own(m.name) is not None)
 
 
 def _own(name: Any) -> type[Effect] | None:
-    """The class CamelCase of the file of that name, if it is an effect."""
+    """Get the class CamelCase of the file of that name, if it is an effect."""
     if not isinstance(name, str) or not name.isidentifier() or not (Path(__file__).parent / f"{name}.py").is_file():
         return None
     module = importlib.import_module(f"{__name__}.{name}")
@@ -56,7 +56,7 @@ def _is_effect(kind: Any) -> bool:
 
 
 def load(spec: str) -> type[Effect]:
-    """The class of an effect that the user names: the file of `path.py:MyEffect` may run from now on.
+    """Load the class of an effect that the user names: the file of `path.py:MyEffect` may run from now on.
 
     Args:
         spec: a name from `names()`, or `path.py:MyEffect`, relative to the working directory.
@@ -70,7 +70,7 @@ def load(spec: str) -> type[Effect]:
 
 
 def recorded(spec: str) -> type[Effect]:
-    """The class of an effect that a file names (settings, effects.yaml, diagnosis.json): `load` without its permission.
+    """Load the class of an effect that a file names (effects.yaml, diagnosis.json): `load` without its permission.
 
     Raises:
         UserError: as `load`; the user has not named the file of code.
@@ -93,7 +93,7 @@ def recorded(spec: str) -> type[Effect]:
 
 
 def known(name: str) -> type[Effect] | None:
-    """The effect of that name: the library's, one that was loaded from a file, or an installed one; None: no such."""
+    """Find the effect of that name: the library's, one loaded from a file, or an installed one; None: no such."""
     found = _own(name) or _brought.get(name)
     if found is None and name in _installed():
         with contextlib.suppress(UserError):
@@ -113,7 +113,7 @@ def _from_file(path: Path, title: str) -> Any:
 
 
 def _checked(kind: Any, spec: str, name: str | None = None) -> type[Effect]:
-    """The class, if it keeps the contract and its name is its own."""
+    """Return the class, if it keeps the contract and its name is its own."""
     if not _is_effect(kind):
         raise UserError(f"effect {spec}: {kind!r} is no subclass of bayessim_mjx.effects.Effect")
     for attribute, what in (("name", "its name"), ("kind", f"one of {', '.join(KINDS)}"), ("quantities", "parameters")):
@@ -145,7 +145,7 @@ def _is_pair_of_texts(value: Any) -> bool:
 
 
 def spec_of(effect: Effect) -> str:
-    """What `load` finds the effect's class by: its name, or `path.py:MyEffect`."""
+    """Give the text by which `load` finds the effect's class: its name, or `path.py:MyEffect`."""
     kind = type(effect)
     if not kind.__module__.startswith(f"{__name__}.own_"):
         return effect.name
@@ -153,7 +153,7 @@ def spec_of(effect: Effect) -> str:
 
 
 def make(effect: str | type[Effect], where: str | tuple[str, ...], **settings: Any) -> Effect:
-    """The effect called `effect` at the place `where`.
+    """Make the effect called `effect` at the place `where`.
 
     Args:
         effect: what `load` takes, or a class.

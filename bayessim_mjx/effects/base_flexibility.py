@@ -52,7 +52,7 @@ class BaseFlexibility(Effect):
     )
 
     def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
-        """The site; refuses robots that nothing holds."""
+        """Bind the site; refuse robots that nothing holds."""
         free = np.flatnonzero(mj_model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
         if len(free) or not mj_model.nv:
             why = f"joint {mj_model.joint(free[0]).name!r} is free" if len(free) else "the model has no joints"
@@ -149,7 +149,7 @@ def _robot(at: Site, step: SubStep, rate: jax.Array, depth: jax.Array) -> _Robot
 
 
 def _root(model: mujoco.MjModel) -> int:
-    """The body of the robot that the world carries."""
+    """Find the body of the robot that the world carries."""
     driven = joint_dofs(model)
     first = driven[driven >= 0][0] if (driven >= 0).any() else 0
     return int(model.body_rootid[model.dof_bodyid[first]])

@@ -34,7 +34,7 @@ class ContactCompliance(Effect):
     quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("softness", 0.0, -2.0, 2.0, grid=(0.1, 0.3, 0.7)),)
 
     def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
-        """The site: geoms that can touch something; refuses solref in the direct format."""
+        """Bind the site: geoms that can touch something; refuse solref in the direct format."""
         at = touching(self, mj_model, timestep, substeps)
         for name, i in zip(at.names, at.ids, strict=True):
             if mj_model.geom_solref[i, 0] <= 0:

@@ -32,7 +32,7 @@ class ContactFriction(Effect):
     quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("scale", 1.0, 0.2, 3.0, grid=(0.1, 0.3, 0.7)),)
 
     def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
-        """The site: geoms that can touch something."""
+        """Bind the site: geoms that can touch something."""
         return touching(self, mj_model, timestep, substeps)
 
     def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":

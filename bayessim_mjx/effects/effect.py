@@ -76,7 +76,7 @@ class Effect(abc.ABC):
         return (self.where,) if isinstance(self.where, str) else tuple(self.where)
 
     def defaults(self) -> ParameterSpace:
-        """The effect's own parameters: kind "effect", nominal = neutral, named `<where>.<effect>.<parameter>`."""
+        """List the effect's own parameters: kind "effect", nominal = neutral, named `<where>.<effect>.<parameter>`."""
         return ParameterSpace(self._parameter(place, q) for place in self.places() for q in self.quantities)
 
     def _parameter(self, place: str, q: Quantity) -> Parameter:
@@ -87,7 +87,7 @@ class Effect(abc.ABC):
         )
 
     def space(self) -> ParameterSpace:
-        """The effect's parameters in the order of `defaults`, with the ranges and priors that hold here."""
+        """Return the effect's parameters in the order of `defaults`, with the ranges and priors that hold here."""
         other = {p.name: p for p in self.parameters}
         return ParameterSpace(other.get(p.name, p) for p in self.defaults().parameters)
 
@@ -145,14 +145,14 @@ class Effect(abc.ABC):
         return model
 
     def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:
-        """The true motion around a start state behind the measured one (the inverse of `on_measurement`).
+        """Find the true motion around a start state behind the measured one (the inverse of `on_measurement`).
 
         Only called where an episode starts in the middle of a log: also fill the memory from `motion` here.
         """
         return memory, motion
 
     def on_record(self, at: Site, memory: Any, before: "Measurement", after: "Measurement", theta: jax.Array) -> Any:
-        """The memory where a recorded state, `after`, takes the place of the simulated one, `before`, at the same time.
+        """Return the memory where a recorded state, `after`, replaces the simulated one, `before`, at the same time.
 
         Only called along the recorded past of what `follows` the motion.
         """

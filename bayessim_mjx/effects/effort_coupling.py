@@ -85,7 +85,7 @@ def neighbours(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _before(model: mujoco.MjModel, joint: int) -> int:
-    """The joint before one on the way to the world, of whatever type; -1: none."""
+    """Find the joint before one on the way to the world, of whatever type; -1: none."""
     body = int(model.jnt_bodyid[joint])
     if joint > model.body_jntadr[body]:
         return joint - 1

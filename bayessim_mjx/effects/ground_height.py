@@ -42,7 +42,7 @@ class GroundHeight(Effect):
     )
 
     def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
-        """The site; refuses models without ground that something could touch."""
+        """Bind the site; refuse models without ground that something could touch."""
         if not len(ground(mj_model)):
             raise UserError(f"{self.name}: nothing that stands still in the model can be touched")
         return find(self, mj_model, timestep, substeps)

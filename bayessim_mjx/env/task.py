@@ -117,7 +117,7 @@ class Task(Env):
 
     @abc.abstractmethod
     def spec(self) -> mujoco.MjSpec:
-        """A fresh specification of the nominal model."""
+        """Make a fresh specification of the nominal model."""
 
     @abc.abstractmethod
     def initial(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -239,7 +239,7 @@ class Task(Env):
         )
 
     def _counted(self, data: mjx.Data) -> dict[str, jax.Array]:
-        """What the physics could not simulate of a control step, as metrics."""
+        """Count what the physics could not simulate of a control step, as metrics."""
         return {} if self.physics.warp is None else {OVERFLOW: overflowed(data)}
 
     def _observe(

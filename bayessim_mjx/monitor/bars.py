@@ -30,7 +30,7 @@ class Bars:
         return kind in self._tasks
 
     def show(self, kind: str, text: str, total: int | None, done: int) -> None:
-        """A new bar, in place of the last one of its kind."""
+        """Show a new bar, in place of the last one of its kind."""
         if kind in self._tasks:
             self._progress.remove_task(self._tasks[kind])
         self._tasks[kind] = self._progress.add_task(

@@ -88,12 +88,12 @@ class Console:
                 self._out.line(line)
 
     def begin(self, rounds: int, done: int = 0) -> None:
-        """Rounds to come, `done` of them finished before (resume)."""
+        """Announce rounds to come, `done` of them finished before (resume)."""
         self._rounds = Clock(rounds, done, self._now)
         self._bar("round", f"round {min(done + 1, rounds)}/{rounds}", rounds, done)
 
     def phase(self, name: str, total: int | None = None, done: int = 0) -> None:
-        """A part of the round begins (train, evaluate, simulate, fit ...), with `total` iterations if it has any."""
+        """Begin a part of the round (train, evaluate, simulate, fit ...), with `total` iterations if it has any."""
         self._phase = name
         self._steps = Clock(total, done, self._now) if total else None
         self._bar("phase", name, total, done)
@@ -103,7 +103,7 @@ class Console:
             self._out.say(f"{where}{name} ..." if not total else f"{where}{name}, {total - done} iterations ...")
 
     def compile(self, message: str, seconds: float, cached: bool = False) -> None:
-        """A program was compiled; its time is kept out of the ETA. `cached`: it came from the compilation cache."""
+        """Keep the time of a compilation out of the ETA. `cached`: the program came from the compilation cache."""
         for clock in (self._rounds, self._steps):
             if clock is not None:
                 clock.exclude(seconds)
@@ -174,10 +174,10 @@ class Console:
             self._bars.move("round", done, "", eta, f"round {min(done + 1, total)}/{total}")
 
     def table(self, parameters: Sequence[Mapping[str, Any]], title: str = "parameters", beside: str = "") -> None:
-        """Closing table, best identified first, of {name, unit, low, high, median, q16, q84, sd, width, truth or None}.
+        """Print the closing table, best identified first: {name, unit, low, high, median, q16, q84, sd, width, truth}.
 
         Args:
-            parameters: q16 to q84 is the 68 % interval, width the posterior's sd over the prior's.
+            parameters: q16 to q84 is the 68 % interval, width the posterior's sd over the prior's; truth may be None.
             title: of the table.
             beside: what else belongs to the posterior, for the line below.
         """
@@ -201,11 +201,11 @@ class Console:
         title: str | None = None,
         left: Collection[int] = (0,),
     ) -> None:
-        """A table of texts: the columns `left` hold words, the others numbers. See `tables.table`."""
+        """Print a table of texts: the columns `left` hold words, the others numbers. See `tables.table`."""
         self._out.grid(header, rows, title, left)
 
     def panel(self, title: str, lines: Sequence[tuple[str, str]], colour: str) -> None:
-        """A frame of `colour` round lines of (text, style), with a title."""
+        """Print a frame of `colour` round lines of (text, style), with a title."""
         self._out.panel(title, lines, colour)
 
     def say(self, text: str, indent: int = 4) -> None:
@@ -213,7 +213,7 @@ class Console:
         self._out.say(text, indent=indent)
 
     def command(self, what: str, command: str) -> None:
-        """A command that the user may want to paste, on lines of its own: it stays whole, whatever the width."""
+        """Print a command that the user may want to paste, on lines of its own: it stays whole, whatever the width."""
         self._out.command(what, command)
 
     def warning(self, text: str) -> None:

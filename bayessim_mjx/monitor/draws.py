@@ -28,7 +28,7 @@ class Draws:
         return len(self.names)
 
     def pick(self, index: Sequence[int] | np.ndarray) -> "Draws":
-        """The draws of some parameters only, in the order of `index`."""
+        """Pick the draws of some parameters only, in the order of `index`."""
         i = np.asarray(index, int)
         names, units = tuple(self.names[j] for j in i), tuple(self.units[j] for j in i)
         prior = None if self.prior is None else self.prior[:, i]
@@ -93,7 +93,7 @@ def draws_of(
 
 
 def natural(values: np.ndarray, log: np.ndarray) -> np.ndarray:
-    """Plotting coordinates [..., d] -> the parameters' own units."""
+    """Convert plotting coordinates [..., d] to the parameters' own units."""
     return np.where(log, 10.0 ** np.where(log, values, 0.0), values)
 
 

@@ -32,14 +32,14 @@ class Motion:
     mocap: np.ndarray | None = None  # [T+1, nmocap, 7] what the task marks in pictures, see `Task.marks`
 
     def captions(self) -> list[str]:
-        """What is written over each row of qpos, `T+1` lines."""
+        """Write the caption over each row of qpos, `T+1` lines."""
         places = 0 if np.abs(self.total).max() >= 100 else 1 if np.abs(self.total).max() >= 10 else 2
         lines = [f"{self.dt * k:.2f} s    return {fixed(float(r), places)}" for k, r in enumerate(self.total)]
         return lines[:-1] + [f"{lines[-1]}    {self.end}".rstrip()]
 
 
 def motion(env: Any, policy: Any, key: Any, theta: Any, length: int) -> Motion:
-    """The motion of a policy, without its exploration, until the episode ends.
+    """Record the motion of a policy, without its exploration, until the episode ends.
 
     Args:
         env, policy: a task of ours and a policy for it.

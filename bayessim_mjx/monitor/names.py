@@ -47,7 +47,7 @@ def shorten(names: Sequence[str], width: int, lines: int = 1) -> list[str]:
 
 
 def _fold(name: str, width: int, lines: int, number: str = "") -> str:
-    """The longest form that fits; one that breaks no word, where it keeps half as much at least."""
+    """Choose the longest form that fits; one that breaks no word, where it keeps half as much at least."""
     most = min(len(name), width * lines - len(number))
     whole, broken = "", ""
     for keep in range(most, 1, -1):  # breaking wastes room at the line ends

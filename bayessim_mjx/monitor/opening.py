@@ -13,7 +13,7 @@ NAMES = {"jax": "MJX's JAX implementation", "warp": "MuJoCo Warp"}
 
 
 def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[str, Any]:
-    """{what: value} for `Console.start`; `infers`: the outer loop, else PPO alone."""
+    """List {what: value} for `Console.start`; `infers`: the outer loop, else PPO alone."""
     lines: dict[str, Any] = {"task": f"{config.task}, {'adaptive domain randomisation' if infers else 'PPO alone'}"}
     if infers or config.randomization.get("randomize"):
         lines["parameters"] = [_range(p) for p in env.space.parameters] or "none"

@@ -43,7 +43,7 @@ class Output:
         title: str | None = None,
         left: Collection[int] = (0,),
     ) -> None:
-        """A table of texts: the columns `left` hold words, the others numbers. See `tables.table`."""
+        """Print a table of texts: the columns `left` hold words, the others numbers. See `tables.table`."""
         plain = [[self.plain(cell) for cell in row] for row in (header, *rows)]
         laid = table(plain[0], plain[1:], self.width, left)
         if not self._blank:
@@ -58,7 +58,7 @@ class Output:
         self.line("")
 
     def panel(self, title: str, lines: Sequence[tuple[str, str]], colour: str) -> None:
-        """A frame of `colour` round lines of (text, style), with a title."""
+        """Print a frame of `colour` round lines of (text, style), with a title."""
         from rich import box
         from rich.panel import Panel
         from rich.text import Text
@@ -70,13 +70,13 @@ class Output:
         self.rich.print(Panel(body, title=name, title_align="left", border_style=colour, box=edge), soft_wrap=False)
 
     def command(self, what: str, command: str) -> None:
-        """A command that the user may want to paste, on lines of its own: it stays whole, whatever the width."""
+        """Print a command that the user may want to paste, on lines of its own: it stays whole, whatever the width."""
         self.say(f"{what}:")
         for line in shell(command, self.limit, 2):
             self.line(line)
 
     def plain(self, text: str) -> str:
-        """What can be written in the encoding of the file."""
+        """Keep what can be written in the encoding of the file."""
         return text if self._unicode else TIE.join(map(ascii_of, text.split(TIE)))
 
     def broken(self, text: str, indent: int) -> list[str]:
@@ -84,7 +84,7 @@ class Output:
         return wrapped(self.plain(text), self.limit, indent)
 
     def say(self, text: str, style: str = "", indent: int = 4) -> None:
-        """A line, or a paragraph whose later lines are indented."""
+        """Print a line, or a paragraph whose later lines are indented."""
         for line in self.broken(text, indent):
             self.line(line, style)
 

@@ -201,7 +201,7 @@ def median_in_words(draws: Draws, k: int) -> str:
 
 
 def natural(draws: Draws, k: int, value: Any) -> Any:
-    """Plotting coordinate -> the parameter's own unit."""
+    """Convert a plotting coordinate to the parameter's own unit."""
     return 10.0**value if draws.log[k] else value
 
 

@@ -46,7 +46,7 @@ def corner(
     best: int = 6,
     truth_label: str = "truth",
 ) -> Any:
-    """The posterior over all parameters: every pair up to 12 parameters, an overview of all and the `best` above that.
+    """Plot the posterior over all parameters: every pair up to 12, above that an overview and the `best`.
 
     Args:
         samples: Distribution, or samples [n, d] with `names`, `low`, `high` [d].

@@ -108,7 +108,7 @@ def _channel(axes: Any, time: np.ndarray, real: np.ndarray, simulated: np.ndarra
 
 
 def quantity(channel: str, unit: str) -> tuple[str, str]:
-    """(what is measured, at which joint): `qvel:elbow` in rad/s -> ("angular velocity", "elbow"); "" if not known."""
+    """Split `qvel:elbow` in rad/s into (what is measured, joint): ("angular velocity", "elbow"); "" if not known."""
     stream, _, joint = channel.partition(":")
     known = {"qpos": {"rad": "angle", "m": "position", "": "orientation"}, "qvel": {"rad/s": "angular velocity"}}
     if not joint or stream not in known:

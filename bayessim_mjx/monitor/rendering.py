@@ -16,7 +16,7 @@ _warned: set[str] = set()
 
 
 def warn_once(text: str) -> None:
-    """A warning that is given once in a process."""
+    """Give a warning once in a process."""
     if text not in _warned:
         _warned.add(text)
         warnings.warn(text, stacklevel=3)
@@ -35,7 +35,7 @@ def backends() -> list[str]:
 
 
 def _open(width: int, height: int) -> Any:
-    """A current OpenGL context, or None with one warning.
+    """Open a current OpenGL context; None with one warning where there is none.
 
     MuJoCo fixes its backend when it is first imported, long before anybody asks for a video; so the context is made
     here from the backend's own module and works whatever was imported before.
@@ -131,7 +131,7 @@ class Renderer:
         return view_of(self.model, self.data, seen, camera, self.aspect)
 
     def frames(self, world: np.ndarray, view: Any, marks: np.ndarray | None = None) -> list[np.ndarray]:
-        """A picture of every row of qpos [T, nq]; rows that repeat the one before are not drawn again."""
+        """Draw a picture of every row of qpos [T, nq]; rows that repeat the one before are not drawn again."""
         self._context.make_current()  # others may have been opened since
         out: list[np.ndarray] = []
         for k, pose in enumerate(world):
@@ -150,7 +150,7 @@ def _freed(picture: "_Picture", context: Any) -> None:
 
 
 def _lit(model: Any, width: int, height: int) -> Any:
-    """A copy with a buffer for pictures of this size, and with light where the model has none."""
+    """Copy the model with a buffer for pictures of this size, and with light where it has none."""
     model = copy.copy(model)
     model.vis.global_.offwidth, model.vis.global_.offheight = 2 * width, 2 * height
     model.vis.quality.offsamples = 0
@@ -199,7 +199,7 @@ class _Picture:
 
 
 def _sum_of_fours(x: np.ndarray) -> np.ndarray:
-    """Sums over 2 x 2 pixels of x [2 H, 2 W, ...]."""
+    """Sum over 2 x 2 pixels of x [2 H, 2 W, ...]."""
     x = x.astype(np.uint16)
     return x[::2, ::2] + x[1::2, ::2] + x[::2, 1::2] + x[1::2, 1::2]
 

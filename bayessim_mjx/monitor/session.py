@@ -96,7 +96,7 @@ class Session:
             self._show_physics(posterior.mean())
 
     def describe(self, text: str) -> None:
-        """The resolved settings as text, once."""
+        """Write the resolved settings as text, once."""
         self.inference.text(SETTINGS, text, code=True)
 
     def _compiled(self, what: str) -> bool:
@@ -278,7 +278,7 @@ def units(mj_model: Any) -> dict[str, str]:
 
 
 def round_line(info: RoundInfo) -> dict[str, Any]:
-    """The numbers of the console's line for a round; a width is posterior sd / prior sd, narrowest first."""
+    """List the numbers of the console's line for a round; a width is posterior sd / prior sd, narrowest first."""
     widths = {}
     if info.posterior is not None:
         relative = info.posterior.estimates().width

@@ -14,7 +14,7 @@ DPI = 120
 
 
 def new_figure(width: float, height: float, layout: str | None = None) -> Any:
-    """A white Figure of width x height inches that belongs to nobody (no pyplot)."""
+    """Make a white Figure of width x height inches that belongs to nobody (no pyplot)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

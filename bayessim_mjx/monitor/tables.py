@@ -36,7 +36,7 @@ def wrapped(text: str, width: int | None, indent: int = 0) -> list[str]:
 
 
 def fit(parts: Sequence[str], room: int, joint: str = ", ", count: bool = True) -> str:
-    """The first parts that fit, then how many more; nothing if not even one fits.
+    """Join the first parts that fit, then how many more; nothing if not even one fits.
 
     Args:
         parts: texts, the most important first.
@@ -53,7 +53,7 @@ def fit(parts: Sequence[str], room: int, joint: str = ", ", count: bool = True) 
 
 
 def shell(command: str, width: int | None, indent: int = 0) -> list[str]:
-    """A command in lines that can be pasted as they are: broken at spaces, with a backslash at the end."""
+    """Break a command into lines that can be pasted as they are: at spaces, with a backslash at the end."""
     before = " " * indent
     lines = wrapped(before + command, width and width - 2, indent + INDENT)
     return [f"{line} \\" for line in lines[:-1]] + lines[-1:]
@@ -102,7 +102,7 @@ def _longest_word(text: str) -> int:
 
 
 def _least(header: Sequence[str], rows: Sequence[Sequence[str]], left: Collection[int]) -> list[int]:
-    """The width [columns] below which a word or a number would break."""
+    """Compute the width [columns] below which a word or a number would break."""
     return [
         max(_longest_word(name), *(_longest_word(row[k]) if k in left else len(row[k]) for row in rows), 0)
         for k, name in enumerate(header)

@@ -74,7 +74,7 @@ def record(
 
 
 def model_at(env: Any, theta: Any) -> Any:
-    """The MuJoCo model of one of our tasks with theta [d] in it, so that a longer rod is drawn longer."""
+    """Make the MuJoCo model of one of our tasks with theta [d] in it, so that a longer rod is drawn longer."""
     return env.space.edit(env.spec(), np.asarray(theta)).compile() if len(env.space) else env.mj_model
 
 

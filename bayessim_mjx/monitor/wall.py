@@ -36,7 +36,7 @@ class Wall:
         self.writer = opened(path / FOLDER, late, more=writers, run=path)
 
     def scalars(self, metrics: Mapping[str, Any]) -> None:
-        """A point for the present second, unless it has one."""
+        """Write a point for the present second, unless it has one."""
         second = int(self.now() - self.started)
         values = {f"{tag}/time": metrics[tag] for tag in TAGS if tag in metrics}
         if values and second > self.last:
@@ -44,7 +44,7 @@ class Wall:
             self.last = second
 
     def mark(self) -> int:
-        """The present second, with no further point in it: a checkpoint of now is gone on from after it."""
+        """Close the present second to further points and return it: a checkpoint of now is resumed after it."""
         self.last = max(self.last, int(self.now() - self.started))
         return self.last
 
@@ -56,6 +56,6 @@ class Wall:
 
 
 def marked(meta: Mapping[str, Any]) -> int:
-    """What `mark` said, as a checkpoint's meta has it; -1 where it has none."""
+    """Read the second of `mark` from a checkpoint's meta; -1 where it has none."""
     second = meta.get("seconds")
     return second if type(second) is int else -1

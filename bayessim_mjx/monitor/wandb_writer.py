@@ -47,7 +47,7 @@ class WandbWriter:
             self._log(step, kept)
 
     def text(self, tag: str, text: str, step: int = 0, code: bool = False) -> None:
-        """Settings (`code`) become the run's configuration there."""
+        """Write a text; settings (`code`) become the run's configuration there."""
         if code:
             import yaml
 
@@ -83,7 +83,7 @@ class WandbWriter:
 
 
 def _taken(folder: Path) -> Any:
-    """The run there of a folder, begun or gone on with."""
+    """Begin, or continue, the run there of a folder."""
     if folder in _open:
         run, users = _open[folder]
         _open[folder] = run, users + 1

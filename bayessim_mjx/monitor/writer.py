@@ -175,7 +175,7 @@ class TensorBoard:
 
 
 def _file(folder: Path, suffix: str) -> Any:
-    """A new event file; to be written, flushed and closed."""
+    """Open a new event file; the caller writes, flushes and closes it."""
     from tensorboardX.event_file_writer import EventsWriter
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -183,7 +183,7 @@ def _file(folder: Path, suffix: str) -> Any:
 
 
 def number(tag: str, value: Any) -> float | None:
-    """A scalar of Python, NumPy or a device; None for None and NaN."""
+    """Convert a scalar of Python, NumPy or a device; None for None and NaN."""
     if value is None:
         return None
     array = np.asarray(value)

@@ -28,7 +28,7 @@ class Writer(Protocol):
         """Markdown, or with `code` a text as it is."""
 
     def figure(self, tag: str, figure: Any, step: int) -> None:
-        """A matplotlib figure, which the last writer closes."""
+        """Write a matplotlib figure, which the last writer closes."""
 
     def video(self, tag: str, frames: np.ndarray | None, fps: float, step: int) -> None:
         """Frames [T, H, W, 3] uint8; None is skipped."""
@@ -47,7 +47,7 @@ def opened(
     more: Sequence[str] = (),
     run: Path | None = None,
 ) -> Writer:
-    """The writer of one of a run's folders.
+    """Open the writer of one of a run's folders.
 
     Args:
         path: that folder, e.g. RUN/rl.
@@ -152,7 +152,7 @@ class Lines:
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """The rows of a file that `Lines` wrote; a last line that was cut short is left out."""
+    """Read the rows of a file that `Lines` wrote; a last line that was cut short is left out."""
     text = path.read_text()
     whole = text[: text.rfind("\n") + 1]
     if path.suffix == ".csv":

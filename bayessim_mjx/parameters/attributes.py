@@ -95,7 +95,7 @@ def element(model: Any, kind: str, target: str) -> int:
 
 
 def suggest(word: str, have: Any) -> str:
-    """What the user may have meant."""
+    """Suggest what the user may have meant."""
     have = list(have)
     close = difflib.get_close_matches(str(word), have, 3)
     return f"did you mean {', '.join(close)}?" if close else f"there are: {', '.join(have) or 'none'}"

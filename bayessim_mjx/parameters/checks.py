@@ -9,14 +9,14 @@ from bayessim_mjx.errors import UserError
 
 
 def mapping(value: Any, where: str) -> Mapping[str, Any]:
-    """A section; nothing at all is an empty one."""
+    """Check that a section is a mapping; nothing at all is an empty one."""
     if value is None or isinstance(value, Mapping):
         return value or {}
     raise UserError(f"{where} = {value!r}: expected a section of `key: value` lines")
 
 
 def known(section: Any, allowed: Sequence[str], where: str) -> None:
-    """A section without other keys than the allowed ones."""
+    """Refuse a section with other keys than the allowed ones."""
     if not isinstance(section, Mapping):
         raise UserError(f"{where} = {section!r}: expected a section with keys of {', '.join(allowed)}")
     for key in section:
@@ -27,7 +27,7 @@ def known(section: Any, allowed: Sequence[str], where: str) -> None:
 
 
 def choice(setting: Mapping[str, Any], key: str, allowed: Sequence[str], default: str, where: str) -> str:
-    """The value of `key`, one of the allowed."""
+    """Return the value of `key`, one of the allowed."""
     value = setting.get(key, default)
     if value not in allowed:
         raise UserError(f"{where}.{key}: {value!r} is none of {', '.join(allowed)}")
@@ -35,7 +35,7 @@ def choice(setting: Mapping[str, Any], key: str, allowed: Sequence[str], default
 
 
 def low_high(setting: Mapping[str, Any], where: str) -> tuple[float, float]:
-    """The setting's `range`, low < high."""
+    """Return the setting's `range`, low < high."""
     value = setting.get("range")
     if value is None:
         raise UserError(f"{where}.range: missing; give [low, high]")
@@ -48,7 +48,7 @@ def low_high(setting: Mapping[str, Any], where: str) -> tuple[float, float]:
 
 
 def number(value: Any, where: str) -> float:
-    """A finite number."""
+    """Return a finite number."""
     found = finite(value)
     if found is None:
         infinite = isinstance(value, float)

@@ -38,7 +38,7 @@ def set_const(model: mjx.Model) -> mjx.Model:
 
 
 def renewed(nominal: mjx.Model, leaves: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """What a timestep reads of what MuJoCo derives from these leaves, by dotted name.
+    """Renew what a timestep reads of what MuJoCo derives from these leaves, by dotted name.
 
     Where none of them differs from the nominal model's the compiler's own numbers stay, not their recomputation in
     float32. What only cameras are placed by is left out.
@@ -64,7 +64,7 @@ def derived(
     reference: mjx.Model | None = None,
     pictures: bool = True,
 ) -> dict[str, jax.Array]:
-    """Derived leaves by dotted name.
+    """Compute derived leaves by dotted name.
 
     Args:
         model: a model (JAX implementation) whose primary fields were changed.
@@ -252,6 +252,6 @@ def bounds(model: mjx.Model, size: jax.Array, geoms: Collection[int]) -> dict[st
 
 
 def _impl(data: mjx.Data, name: str) -> jax.Array:
-    """A field of Data that newer MJX keeps in the implementation's part."""
+    """Get a field of Data that newer MJX keeps in the implementation's part."""
     inner = getattr(data, "_impl", None)
     return getattr(inner, name) if inner is not None and hasattr(inner, name) else getattr(data, name)

@@ -18,7 +18,7 @@ PRIMITIVE = (SPHERE, CAPSULE, CYLINDER, BOX, ELLIPSOID)
 
 
 def rotation(quat: Any, xp: Any = jnp) -> Any:
-    """Unit quaternions `[..., 4]` (w, x, y, z) -> rotation matrices `[..., 3, 3]`."""
+    """Convert unit quaternions `[..., 4]` (w, x, y, z) to rotation matrices `[..., 3, 3]`."""
     w, x, y, z = (quat[..., i] for i in range(4))
     return xp.stack(
         [
@@ -55,7 +55,7 @@ def rbound(kind: int, size: jax.Array) -> jax.Array:
 
 
 def long_axis(model: Any, body: int, label: str = "length") -> tuple[float, float, float]:
-    """Unit vector in the body frame along which the body is longest.
+    """Find the unit vector in the body frame along which the body is longest.
 
     The axis of its longest geom; for spheres or without geoms the direction of the centre of mass, else of a child.
 

@@ -19,7 +19,7 @@ class Space(Protocol):
 
 
 def _library(space: Space) -> Any:
-    """What computes with the ends of the ranges: constants stay numpy's."""
+    """Choose the library that computes with the ends of the ranges: constants stay numpy's."""
     return np if isinstance(space.low, np.ndarray) else jnp
 
 

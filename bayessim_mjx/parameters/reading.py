@@ -41,7 +41,7 @@ DISTRIBUTIONS = {"uniform": "uniform", "loguniform": "loguniform", "log_uniform"
 
 
 def read(section: Mapping[str, Any], model: mujoco.MjModel) -> list[Parameter]:
-    """The model's parameters of a section, in order; those of its effects are not among them.
+    """Read the model's parameters of a section, in order; those of its effects are not among them.
 
     Args:
         section: `randomization_params`, or the `task` section that holds it.
@@ -75,7 +75,7 @@ def effect_groups(section: Mapping[str, Any]) -> Iterator[tuple[str, str, str, M
 
 
 def effect_parameter(default: Parameter, setting: Any, where: str) -> Parameter:
-    """An effect's own parameter with range and prior of `setting`; nominal stays, or is the range's end next to it."""
+    """Give an effect's parameter the range and prior of `setting`; nominal stays, or is the range's end next to it."""
     setting = checks.mapping(setting, where)
     checks.known(setting, (*EFFECT_SETTINGS, *ACCEPTED), where)
     checks.choice(setting, "operation", ("absolute",), "absolute", where)
@@ -90,7 +90,7 @@ def effect_parameter(default: Parameter, setting: Any, where: str) -> Parameter:
 
 
 def _open(section: Any) -> tuple[Mapping[str, Any], dict[str, Mapping[str, Any]]]:
-    """(the `randomization_params`, its actors), after a look at the keys that are not about parameters."""
+    """Open a section as (the `randomization_params`, its actors); look at the keys that are not about parameters."""
     section = checks.mapping(section, PATH)
     if "randomization_params" in section:
         section = checks.mapping(section["randomization_params"], PATH)
@@ -213,7 +213,7 @@ def _driven(model: mujoco.MjModel, kind: str, attribute: str, target: str, opera
 
 
 def _build(setting: Mapping[str, Any], where: str, name: str, own: float, **rest: Any) -> Parameter:
-    """A Parameter from the keys range, distribution, mean, sd, nominal; nominal = the model's own value, clipped."""
+    """Build a Parameter of the keys range, distribution, mean, sd, nominal (by default the model's value, clipped)."""
     low, high = checks.low_high(setting, where)
     distribution = checks.choice(setting, "distribution", tuple(DISTRIBUTIONS), "uniform", where)
     nominal = checks.number(setting.get("nominal", min(max(own, low), high)), f"{where}.nominal")
@@ -241,7 +241,7 @@ def _own(model: mujoco.MjModel, kind: str, attribute: str, target: str, operatio
 
 
 def own_value(model: mujoco.MjModel, kind: str, attribute: str, target: str) -> float:
-    """The model's own number; restitution counts as 0, lengths and scales as 1."""
+    """Return the model's own number; restitution counts as 0, lengths and scales as 1."""
     if kind == "option":
         return float(model.opt.gravity[2])
     if (kind, attribute) in FIELDS:

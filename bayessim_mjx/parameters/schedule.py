@@ -45,7 +45,7 @@ class Schedule:
         return cls(course, int(steps))
 
     def strength(self, clock: jax.Array) -> jax.Array:
-        """The share [0, 1] of the randomisation at `clock` control steps."""
+        """Compute the share [0, 1] of the randomisation at `clock` control steps."""
         if not self.steps:
             return jnp.ones_like(clock, jnp.float32)
         if self.course == "linear":

@@ -42,7 +42,7 @@ class ParameterSpace:
 
     @classmethod
     def from_config(cls, randomization_params: Mapping[str, Any], mj_model: "mujoco.MjModel") -> "ParameterSpace":
-        """The space of a `randomization_params` section in BayesSimIG's YAML format (see `reading.py`).
+        """Make the space of a `randomization_params` section in BayesSimIG's YAML format (see `reading.py`).
 
         Without the parameters of its `effects`, which `effects.support.reading.stack` makes.
 
@@ -82,7 +82,7 @@ class ParameterSpace:
         raise UserError(f"no parameter {name!r}; {hint}")
 
     def subset(self, names: Sequence[str]) -> "ParameterSpace":
-        """The named parameters, in the order given."""
+        """Keep the named parameters, in the order given."""
         return ParameterSpace(self.parameters[self.index(name)] for name in names)
 
     def vector(self, values: Mapping[str, float] | Sequence[float] | np.ndarray) -> np.ndarray:
@@ -127,7 +127,7 @@ class ParameterSpace:
         return jnp.where(self.contains(theta), jnp.sum(priors.log_density(self, theta), axis=-1), -jnp.inf)
 
     def write(self, model: "mjx.Model", theta: Any, derived: bool = True) -> "mjx.Model":
-        """The nominal `model` with theta `[d]` written into it, derived constants recomputed. Pure; use under `vmap`.
+        """Write theta `[d]` into the nominal `model`, derived constants recomputed. Pure; use under `vmap`.
 
         Changes are relative to `model`, so always pass the nominal one. Leaves that no parameter concerns stay the
         identical objects. Parameters of kind "effect" are ignored.
@@ -139,7 +139,7 @@ class ParameterSpace:
         return writing.write(self.parameters, model, theta, derived)
 
     def edit(self, spec: "mujoco.MjSpec", theta: Any) -> "mujoco.MjSpec":
-        """A copy of the nominal `spec` with the same change made in the MJCF; it compiles to what `write` makes."""
+        """Make the same change in a copy of the nominal MJCF `spec`; it compiles to what `write` makes."""
         from bayessim_mjx.parameters import editing
 
         return editing.edit(self.parameters, spec, self.vector(theta))

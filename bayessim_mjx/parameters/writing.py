@@ -35,7 +35,7 @@ def write(parameters: Sequence[Parameter], model: "mjx.Model", theta: Any, deriv
 def _changes(
     physical: tuple[tuple[int, Parameter], ...], derived: bool, model: "mjx.Model", theta: jax.Array
 ) -> dict[str, jax.Array]:
-    """The leaves that differ from `model`'s, by dotted name."""
+    """Compute the leaves that differ from `model`'s, by dotted name."""
     draft = Draft(model)
     for (kind, attribute), members in _groups(physical).items():
         parameters = [p for _, p in members]
@@ -75,7 +75,7 @@ def _groups(physical: Sequence[tuple[int, Parameter]]) -> dict[tuple[str, str], 
 
 
 def _applied(parameter: Parameter, old: jax.Array, value: jax.Array, sign: float = 1.0) -> jax.Array:
-    """The number in the model under an operation: scaling, additive, absolute."""
+    """Compute the number in the model under an operation: scaling, additive, absolute."""
     if parameter.operation == "scaling":
         return old * value
     step = sign * parameter.factor * value
@@ -107,7 +107,7 @@ def _write_field(draft: Draft, field: Field, parameters: Sequence[Parameter], va
 
 
 def _ratios(draft: Draft, field: str, ids: np.ndarray, parameters: Sequence[Parameter], values: jax.Array) -> jax.Array:
-    """new / old of a field for each parameter, `[n]`."""
+    """Compute new / old of a field for each parameter, `[n]`."""
     ratios = []
     for j, (i, p) in enumerate(zip(ids, parameters, strict=True)):
         old = draft[field][i]
@@ -199,7 +199,7 @@ def _stretch(draft: Draft, body: int, axis: np.ndarray, s: jax.Array) -> None:
 
 
 def _lengthen(draft: Draft, geom: int, axis: np.ndarray, s: jax.Array) -> None:
-    """The half extents of a geom whose axis lies along the stretch; a radius stays."""
+    """Lengthen the half extents of a geom whose axis lies along the stretch; a radius stays."""
     kind = int(draft.model.geom_type[geom])
     columns = {geometry.CAPSULE: {2: 1}, geometry.CYLINDER: {2: 1}}.get(kind, {0: 0, 1: 1, 2: 2})
     if kind in (geometry.SPHERE, int(mujoco.mjtGeom.mjGEOM_MESH)):

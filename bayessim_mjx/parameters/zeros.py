@@ -5,7 +5,7 @@ from typing import Any
 
 
 def with_zeros(section: Mapping[str, Any], zeros: Mapping[str, float]) -> Mapping[str, Any]:
-    """A `randomization_params` whose joints' attributes have `zero`, where they do not say another.
+    """Give joints' attributes their `zero` in a `randomization_params`, where they do not say another.
 
     Args:
         section: not changed.

@@ -18,7 +18,7 @@ EDGE = 1e-6  # how far a Beta's samples stay from the ends, of the range: its de
 
 
 def bounded(raw: jax.Array, limit: float, squash: bool) -> jax.Array:
-    """What the environment gets of raw actions: within +- limit."""
+    """Clip raw actions to +- limit, for the environment."""
     return limit * jnp.tanh(raw) if squash else jnp.clip(raw, -limit, limit)
 
 
@@ -63,11 +63,11 @@ class Gaussian:
     squash: bool = False
 
     def mean(self, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-        """The raw action that the deterministic policy takes."""
+        """Compute the raw action that the deterministic policy takes."""
         return mean
 
     def sd(self, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-        """Standard deviation of raw actions."""
+        """Compute the standard deviation of raw actions."""
         return jnp.exp(log_std)
 
     def noise(self, key: jax.Array, steps: int, worlds: int, size: int) -> jax.Array:
@@ -142,7 +142,7 @@ Law = Gaussian | Beta
 
 
 def of(config: Any) -> Law:
-    """The distribution that `ppo:` settings ask for."""
+    """Choose the distribution of the `ppo:` settings."""
     if config.distribution == "beta":
         return Beta(config.action_clip)
     return Gaussian(config.action_clip, config.action_bound == "tanh")

@@ -60,7 +60,7 @@ def _refuse_together(extension: Extension, names: list[str], config: PPOConfig) 
 
 
 def _installed(given: Mapping[str, Any]) -> Extension:
-    """The extension `{extension: NAME, setting: value, ...}` of an installed package."""
+    """Load the extension `{extension: NAME, setting: value, ...}` of an installed package."""
     points = {point.name: point for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
     name, settings = given["extension"], {k: v for k, v in given.items() if k != "extension"}
     if name not in points:
@@ -83,7 +83,7 @@ def _installed(given: Mapping[str, Any]) -> Extension:
 
 
 def _checked(extension: Any) -> Extension:
-    """The object, if it keeps the contract."""
+    """Return the object, if it keeps the contract."""
     kind = type(extension)
     if not isinstance(extension, Extension):
         raise UserError(f"ppo.extensions: {extension!r} is no object of a subclass of bayessim_mjx.rl.Extension")

@@ -29,7 +29,7 @@ TAGS = (
 
 
 def teacher_group(env: Env) -> str:
-    """The observation group that the teacher sees: "teacher" where there is one, else the student's."""
+    """Name the observation group that the teacher sees: "teacher" where there is one, else the student's."""
     return "teacher" if "teacher" in env.observation_size else "policy"
 
 

@@ -66,7 +66,7 @@ def evaluate_together(
 
 
 def _sound(found: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """What was found, where all contacts had room."""
+    """Return what was found, where all contacts had room."""
     if (lost := found.pop(OVERFLOW, None)) is not None:
         refuse_overflow(lost.mean(), "the episodes that were evaluated")
     return found

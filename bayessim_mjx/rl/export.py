@@ -61,7 +61,7 @@ def _graph(policy: Policy, env: Env, actions: int) -> tuple[Graph, dict[str, int
 
 
 def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None) -> Any:
-    """The `onnx.ModelProto` of a policy of `env`; `notes`: more metadata. UserError where onnx is not installed."""
+    """Build the `onnx.ModelProto` of a policy of `env`; `notes`: more metadata. UserError without onnx."""
     try:
         import onnx
         from onnx import helper
@@ -87,7 +87,7 @@ def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None)
 
 
 def metadata(policy: Policy, env: Env) -> dict[str, Any]:
-    """What the inputs and outputs are, in their order, and golden pairs of observations and actions."""
+    """Describe the inputs and outputs, in their order, with golden pairs of observations and actions."""
     scaling, golden = command_scale(env, env.action_size - recurrent.memory_size(policy.actor)), golden_inputs(policy)
     facts = {
         "task": env.name,
@@ -106,7 +106,7 @@ def metadata(policy: Policy, env: Env) -> dict[str, Any]:
 
 
 def golden_inputs(policy: Policy, count: int = GOLDEN) -> dict[str, jax.Array]:
-    """Inputs [count, ...]: observations spread like those of the training, some far outside; and memories."""
+    """Draw inputs [count, ...]: observations spread like those of the training, some far outside; and memories."""
     key, memory_key = jax.random.split(jax.random.PRNGKey(0))
     noise = jax.random.normal(key, (count, policy.normalizer.mean.shape[0]))
     factor = jnp.where(jnp.arange(count) % 4 == 3, 20.0, 1.0)[:, None]
@@ -116,7 +116,7 @@ def golden_inputs(policy: Policy, count: int = GOLDEN) -> dict[str, jax.Array]:
 
 
 def answer(policy: Policy, inputs: Mapping[str, Any]) -> jax.Array:
-    """The deterministic actions [N, A] in [-1, 1] at these inputs."""
+    """Compute the deterministic actions [N, A] in [-1, 1] at these inputs."""
     acted = policy.act(None, {"policy": inputs["observation"]} | {k: inputs[k] for k in inputs if k == "memory"})
     return jnp.clip(acted[:, : acted.shape[1] - recurrent.memory_size(policy.actor)], -1.0, 1.0)
 

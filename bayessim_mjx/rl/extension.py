@@ -63,11 +63,11 @@ class Extension:
 
     @classmethod
     def of(cls, config: PPOConfig) -> Extension | None:
-        """The extension with its settings; None where these switch it off. For those with settings in `ppo:`."""
+        """Make the extension of the settings; None where they switch it off. For those with settings in `ppo:`."""
         raise NotImplementedError
 
     def shown(self, env: Env) -> Any:
-        """The environment as the learner is to see it; the same object for the same environment."""
+        """Wrap the environment as the learner is to see it; the same object for the same environment."""
         return env
 
     def check(self, learner: Learner) -> None:
@@ -113,13 +113,13 @@ class Extension:
         return None
 
     def samples(self, batch: Batch) -> Batch:
-        """What surrogate and critic learn from: the batch, and behind it more samples where there are some."""
+        """Add samples for surrogate and critic behind the batch, where there are some."""
         return batch
 
     def loss(
         self, params: Params, batch: Batch, means: jax.Array, learner: Learner
     ) -> tuple[jax.Array | None, Figures]:
-        """(a term to add to the loss of a minibatch, or None; figures without axes).
+        """Compute (a term to add to the loss of a minibatch, or None; figures without axes).
 
         Args:
             params: actor and critic.

@@ -111,13 +111,13 @@ def adapt(learning_rate: jax.Array, kl: jax.Array, desired_kl: float) -> jax.Arr
 
 
 def clip_norm(gradient: jax.Array, limit: float) -> tuple[jax.Array, jax.Array]:
-    """The flat gradient scaled down to the norm `limit` where it is longer, and its norm before."""
+    """Scale the flat gradient down to the norm `limit` where it is longer; return it and its norm before."""
     norm = jnp.linalg.norm(gradient)
     return gradient * jnp.minimum(1.0, limit / (norm + 1e-6)), norm
 
 
 def minibatches(key: jax.Array, epochs: int, size: int, count: int, mesh: Mesh | None = None) -> jax.Array:
-    """Indices [epochs * count, size // count]: a fresh permutation of all `size` transitions in each epoch.
+    """Draw indices [epochs * count, size // count]: a fresh permutation of all `size` transitions in each epoch.
 
     A remainder is left out at the end of each permutation, so a different one in each epoch. Devices of a mesh share
     every minibatch; the minibatches are those of one device.

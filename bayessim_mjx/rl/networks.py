@@ -46,7 +46,7 @@ LEAST_STD = 1e-6  # of a spread that is a parameter itself, without limits of it
 
 
 def activation(name: str) -> Callable[[jax.Array], jax.Array]:
-    """The activation function called `name`; UserError listing the known ones."""
+    """Find the activation function called `name`; UserError listing the known ones."""
     if name not in ACTIVATIONS:
         raise UserError(f"ppo.activation = {name!r}: allowed are {', '.join(ACTIVATIONS)}")
     return ACTIVATIONS[name]
@@ -66,7 +66,7 @@ class Form:
 
 
 def form(config: PPOConfig) -> Form:
-    """That of the networks that the settings ask for."""
+    """Read the form of the networks from the settings."""
     return Form(config.activation, config.std_range, config.distribution == "beta", config.precision == "bfloat16")
 
 
@@ -88,7 +88,7 @@ def mlp_init(key: jax.Array, sizes: Sequence[int], last_gain: float, kind: str =
 
 
 def mlp(layers: list[Params], x: jax.Array, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    """The perceptron at x [..., in] -> [..., out]; the last layer is linear.
+    """Apply the perceptron to x [..., in] -> [..., out]; the last layer is linear.
 
     Of a `Form` of half precision, what a layer is given and what hidden ones give is bfloat16; the result is float32.
     """
@@ -142,12 +142,12 @@ def _actor(key: jax.Array, sizes: Sizes, config: PPOConfig) -> Params:
 
 
 def _second(key: jax.Array, like: jax.Array, config: PPOConfig) -> Params:
-    """A Beta's other concentration: small outputs, as the first."""
+    """Make a Beta's other concentration: small outputs, as the first."""
     return mlp_init(key, like.shape, 0.01, config.weight_init)[0]
 
 
 def _spread(key: jax.Array, like: jax.Array, config: PPOConfig) -> Params:
-    """Outputs for a spread that depends on the state: they begin at init_std, orthogonal weights everywhere."""
+    """Make outputs for a spread that depends on the state: they begin at init_std, orthogonal weights everywhere."""
     bias = jnp.full(like.shape[-1], LOG_STD_LIMIT * np.arctanh(np.log(config.init_std) / LOG_STD_LIMIT))
     weights = jnp.zeros_like(like)
     if config.weight_init == "lecun_uniform":
@@ -156,7 +156,7 @@ def _spread(key: jax.Array, like: jax.Array, config: PPOConfig) -> Params:
 
 
 def _trunk(actor: Params, x: Any) -> jax.Array:
-    """What the actor's layers see of normalised observations x, of `recurrent` where it has a memory."""
+    """Compute the input of the actor's layers at normalised observations x, of `recurrent` where it has a memory."""
     return recurrent.features(actor, x) if recurrent.kind(actor) else x
 
 
@@ -182,7 +182,7 @@ def gaussian(actor: Params, x: Any, act: Callable[[jax.Array], jax.Array]) -> tu
 
 
 def distribution(actor: Params, x: Any, form: Any) -> tuple[jax.Array, jax.Array]:
-    """The two parameters of the distribution of raw actions (`actions`) at normalised observations x."""
+    """Compute the two parameters of the distribution of raw actions (`actions`) at normalised observations x."""
     if not getattr(form, "beta", False):
         return gaussian(actor, x, form)
     a, b = jnp.split(1 + jax.nn.softplus(mlp(actor["layers"], _trunk(actor, x), form)), 2, -1)
@@ -195,7 +195,7 @@ def mean_action(params: Params, x: Any, act: Callable[[jax.Array], jax.Array], l
 
 
 def value(params: Params, x: Any, act: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    """The critic's value [...] at normalised observations x [..., S]."""
+    """Compute the critic's value [...] at normalised observations x [..., S]."""
     if "head" in params["critic"]:
         actor = params["actor"]
         return mlp([*actor["layers"][:-1], *params["critic"]["head"]], _trunk(actor, x), act)[..., 0]
@@ -223,7 +223,7 @@ class Policy:
         return actions.Beta(self.action_clip) if self.beta else actions.Gaussian(self.action_clip, self.squash)
 
     def _seen(self, obs: Mapping[str, jax.Array] | jax.Array) -> Any:
-        """What the actor sees: normalised, with the memory where it has one."""
+        """Compute the actor's input: normalised, with the memory where it has one."""
         x = jnp.asarray(obs["policy"] if isinstance(obs, Mapping) else obs)
         x = normalise.normalise(self.normalizer, x) if self.normalize else x
         if recurrent.kind(self.actor):
@@ -239,13 +239,13 @@ class Policy:
         return distribution(self.actor, self._seen(obs), Form(self.activation, self.std_range, self.beta, self.half))
 
     def carried(self, obs: Mapping[str, jax.Array] | jax.Array, action: jax.Array) -> jax.Array:
-        """The action for the environment: with the memory after `obs` behind it, where there is one."""
+        """Append the memory after `obs` to the environment's action, where there is one."""
         if not recurrent.kind(self.actor):
             return action
         return jnp.concatenate([action, recurrent.memories(self.actor, self._seen(obs))], -1)
 
     def bounded(self, raw: jax.Array) -> jax.Array:
-        """The action within +- action_clip of a raw one."""
+        """Clip a raw action to +- action_clip."""
         return actions.bounded(raw, self.action_clip, self.squash)
 
     def log_prob(self, obs: Mapping[str, jax.Array] | jax.Array, raw: jax.Array) -> jax.Array:
@@ -254,7 +254,7 @@ class Policy:
         return density - log_slope(raw, self.action_clip) if self.squash else density
 
     def act(self, key: jax.Array | None, obs: Mapping[str, jax.Array] | jax.Array) -> jax.Array:
-        """Action [..., A] within +- action_clip: at the mean if `key` is None, else a sample; a memory behind it."""
+        """Choose actions [..., A] in +- action_clip: the mean if `key` is None, else a sample; a memory behind it."""
         found = self.distribution(obs)
         raw = self.law.mean(*found) if key is None else self.law.drawn(key, *found)
         return self.carried(obs, self.bounded(raw))

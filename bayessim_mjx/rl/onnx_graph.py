@@ -34,7 +34,7 @@ class Graph:
         return self.value
 
     def at(self, value: str) -> Graph:
-        """The same graph, to be gone on with from another value."""
+        """Continue the same graph from another value."""
         self.value = value
         return self
 
@@ -55,7 +55,7 @@ class Graph:
         return name
 
     def activate(self, name: str) -> None:
-        """The activations of `networks.ACTIVATIONS`."""
+        """Apply one of `networks.ACTIVATIONS`."""
         x = self.value
         if name in ONE_NODE:
             self.then(ONE_NODE[name])
@@ -130,13 +130,13 @@ def _remember(graph: Graph, actor: Any) -> None:
 
 
 def _gates(graph: Graph, value: str, side: Any, count: int) -> list[str]:
-    """The sums of each gate over the input, or over the hidden units."""
+    """Sum each gate over the input, or over the hidden units."""
     graph.at(value).then("Gemm", side["w"], side["b"])
     return graph.split(count)
 
 
 def _gru(graph: Graph, layer: Any, memory: str, output: str) -> str:
-    """The running value -> `output`, the memory after it, as `recurrent.gru` does; what the next layer sees."""
+    """Add `recurrent.gru`: the running value -> `output`, the memory after it; return what the next layer sees."""
     observed = _gates(graph, graph.value, layer["x"], 3)
     remembered = _gates(graph, memory, layer["h"], 3)
     sums = [graph.at(x).then("Add", h) for x, h in zip(observed[:2], remembered[:2], strict=True)]
@@ -150,7 +150,7 @@ def _gru(graph: Graph, layer: Any, memory: str, output: str) -> str:
 
 
 def _lstm(graph: Graph, layer: Any, memory: str, output: str) -> str:
-    """The running value -> `output`, the memory after it, as `recurrent.lstm` does; its hidden units."""
+    """Add `recurrent.lstm`: the running value -> `output`, the memory after it; return its hidden units."""
     observed = graph.then("Gemm", layer["x"]["w"], layer["x"]["b"])
     hidden, cells = graph.at(memory).split(2)
     graph.at(hidden).then("Gemm", layer["h"]["w"], layer["h"]["b"])

@@ -41,7 +41,7 @@ def layout(state: TrainState) -> TrainState:
 
 
 def in_worlds_of(state: TrainState, other: TrainState) -> TrainState:
-    """The learner of `state` in the worlds of `other`, with the sums that run over these worlds."""
+    """Put the learner of `state` in the worlds of `other`, with the sums that run over these worlds."""
     kept = {e.name: e for e in catalogue.active(state.config) if e.name in state.extensions}
     moved = {name: e.in_worlds_of(state.extensions[name], other.extensions[name]) for name, e in kept.items()}
     return state.replace(env_states=other.env_states, episodes=other.episodes, extensions=moved)
@@ -55,7 +55,7 @@ def init(
     mesh: Mesh | None = None,
     clock: int = 0,
 ) -> TrainState:
-    """The state before the first update.
+    """Make the state before the first update.
 
     Args:
         env: the environment.
@@ -117,7 +117,7 @@ def _init(env: Env, config: PPOConfig, mesh: Mesh | None) -> Callable[..., Train
 
 
 def _begun(learner: Learner, key: jax.Array, sizes: Sizes) -> dict[str, Any]:
-    """The states that extensions begin with, by name."""
+    """Begin the states of extensions, by name."""
     states = {e.name: e.init(key, sizes, learner.config) for e in learner.extensions}
     return {name: own for name, own in states.items() if own is not None}
 
@@ -135,7 +135,7 @@ def _rewarded(learner: Learner, state: TrainState, data: dict, key: jax.Array) -
 
 
 def moved_on(config: PPOConfig, state: TrainState, env_states: State, data: dict, key: jax.Array) -> TrainState:
-    """The state after a collection: worlds, episodes and counters; what is learnt from it is as before."""
+    """Move the state on after a collection: worlds, episodes and counters; the learner is as before."""
     return dataclasses.replace(
         state,
         env_states=env_states,

@@ -25,12 +25,12 @@ KEPT = ("activation", "normalize", "action_clip", "squash", "std_range", "beta")
 
 
 def names(folder: Path = FOLDER) -> tuple[str, ...]:
-    """The tasks that a policy comes for."""
+    """List the tasks that a policy comes for."""
     return tuple(_index(folder))
 
 
 def about(task: str, folder: Path = FOLDER) -> dict[str, Any]:
-    """What is known of the policy of `task`: file, sha256, settings, command, versions, and its return.
+    """Describe the policy of `task`: file, sha256, settings, command, versions, and its return.
 
     `return` has mean and sd over `episodes` episodes at nominal physics.
 
@@ -46,7 +46,7 @@ def about(task: str, folder: Path = FOLDER) -> dict[str, Any]:
 
 
 def pretrained(task: str, folder: Path = FOLDER) -> Policy:
-    """The policy for `task` that comes with the package; it acts on the task at its default settings.
+    """Load the policy for `task` that comes with the package; it acts on the task at its default settings.
 
     Args:
         task: a task's name; case and underscores do not matter.

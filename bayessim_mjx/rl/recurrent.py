@@ -66,7 +66,7 @@ def _key(cell: str, i: int) -> str:
 
 
 def gru(layer: Params, memory: jax.Array, x: jax.Array) -> jax.Array:
-    """The memory [..., H] after observations x [..., S]; gates in the order reset, update, candidate."""
+    """Compute the memory [..., H] after observations x [..., S]; gates in the order reset, update, candidate."""
     xr, xz, xn = jnp.split(x @ layer["x"]["w"] + layer["x"]["b"], 3, -1)
     hr, hz, hn = jnp.split(memory @ layer["h"]["w"] + layer["h"]["b"], 3, -1)
     reset, update = jax.nn.sigmoid(xr + hr), jax.nn.sigmoid(xz + hz)
@@ -75,7 +75,7 @@ def gru(layer: Params, memory: jax.Array, x: jax.Array) -> jax.Array:
 
 
 def lstm(layer: Params, memory: jax.Array, x: jax.Array) -> jax.Array:
-    """The memory [..., 2 H] = (h, c) after observations x [..., S]; gates: input, forget, candidate, output."""
+    """Compute the memory [..., 2 H] = (h, c) after x [..., S]; gates: input, forget, candidate, output."""
     hidden, cells = jnp.split(memory, 2, -1)
     sums = x @ layer["x"]["w"] + layer["x"]["b"] + hidden @ layer["h"]["w"] + layer["h"]["b"]
     take, keep, new, show = jnp.split(sums, 4, -1)
@@ -96,7 +96,7 @@ CELLS = {"gru": Cell(3, gru), "lstm": Cell(4, lstm)}
 
 
 def kind(actor: Params) -> str | None:
-    """The name of its recurrent layer, which is the key of its parameters; None without one."""
+    """Name its recurrent layer, which is the key of its parameters; None without one."""
     return next((name for name in CELLS if name in actor), None)
 
 
@@ -110,7 +110,7 @@ def layers(actor: Params) -> list[Params]:
 
 
 def units(actor: Params) -> int:
-    """Outputs of a recurrent layer, 0 without one."""
+    """Count outputs of a recurrent layer, 0 without one."""
     name = kind(actor)
     return 0 if name is None else len(actor[name]["h"]["w"])
 
@@ -122,7 +122,7 @@ def memory_size(actor: Params) -> int:
 
 
 def memories(actor: Params, x: Remembered | Sequences) -> jax.Array:
-    """The memory after each observation, [..., M]."""
+    """Compute the memory after each observation, [..., M]."""
     name = kind(actor)
     assert name is not None
     stack, cell, outputs = layers(actor), CELLS[name], units(actor)
@@ -147,7 +147,7 @@ def memories(actor: Params, x: Remembered | Sequences) -> jax.Array:
 
 
 def features(actor: Params, x: Remembered | Sequences) -> jax.Array:
-    """The last layer's outputs after each observation, [..., H]: what the actor's other layers see."""
+    """Compute the last layer's outputs after each observation, [..., H]: the input of the actor's other layers."""
     whole, last = memories(actor, x), memory_size(actor) - memory_size(actor) // len(layers(actor))
     return whole[..., last : last + units(actor)]
 

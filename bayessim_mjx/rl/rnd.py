@@ -40,7 +40,7 @@ class RND:
 
 
 def groups(sizes: Mapping[str, tuple[int, ...]], config: RNDConfig) -> tuple[str, ...]:
-    """The observation groups that the networks see, of those in `sizes`: as set, else "rnd_state", else "policy"."""
+    """Choose the networks' observation groups from those in `sizes`: as set, else "rnd_state", else "policy"."""
     chosen = config.obs_groups or ("rnd_state" if "rnd_state" in sizes else "policy",)
     for group in chosen:
         if group not in sizes:
@@ -51,7 +51,7 @@ def groups(sizes: Mapping[str, tuple[int, ...]], config: RNDConfig) -> tuple[str
 
 
 def joined(obs: Mapping[str, jax.Array], chosen: Sequence[str]) -> jax.Array:
-    """The chosen groups side by side, [..., S]."""
+    """Join the chosen groups side by side, [..., S]."""
     return jnp.concatenate([obs[group] for group in chosen], -1)
 
 
@@ -88,7 +88,7 @@ def init(key: jax.Array, size: int, partial: jax.Array, config: RNDConfig) -> RN
 
 
 def weight(config: RNDConfig, step: jax.Array) -> jax.Array:
-    """The weight at control step `step` (from 1), in the units of ppo.rnd.weight."""
+    """Compute the weight at control step `step` (from 1), in the units of ppo.rnd.weight."""
     schedule, start = config.weight_schedule, jnp.full(jnp.shape(step), config.weight, jnp.float32)
     if schedule is None or schedule.mode == "constant":
         return start
@@ -125,7 +125,7 @@ def in_spreads(rnd: RND, values: jax.Array, gamma: float) -> tuple[RND, jax.Arra
 def reward(
     rnd: RND, obs: jax.Array, terminated: jax.Array, truncated: jax.Array, config: RNDConfig, dt: float, gamma: float
 ) -> tuple[RND, jax.Array, jax.Array]:
-    """The state after what was collected, the observations as the networks see them, and the reward [T, N].
+    """Compute (the state after the collection, the networks' observations, the reward [T, N]).
 
     The reward is weight(t) dt novelty: `weight` is per second, at every control step.
 
@@ -220,7 +220,7 @@ class Novelty(Extension):
         return init(branch(key, 1), size, sizes.partial, self.settings)
 
     def reward(self, own: RND, data: dict, key: jax.Array, learner: Learner) -> tuple[RND, jax.Array, Figures]:
-        """The reward is for the novelty before the predictor learns what was collected."""
+        """Reward the novelty before the predictor learns the collected observations."""
         config, mesh = learner.config, learner.mesh
         after = joined(data["final_observation"], self.groups(learner.env.observation_size))
         ends = (data["terminated"], data["truncated"])

@@ -46,7 +46,7 @@ def cut(batch: Any, length: int) -> Any:
 
 
 def renewed(params: networks.Params, batch: Any, config: PPOConfig) -> tuple[Any, jax.Array]:
-    """The segments [S, L, ...] as S L transitions, with advantages and returns by the critic `params`; and its values.
+    """Make S L transitions of the segments [S, L, ...], advantages and returns by the critic `params`; and its values.
 
     Inside a segment the next value is that of the next observation seen, but the one from the collection where an
     episode is cut off: the true next observation is then not the next one seen. No gradient flows through advantages

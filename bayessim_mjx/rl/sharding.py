@@ -32,14 +32,14 @@ def pinned(tree: Any, mesh: Mesh | None, spec: Any = EVERYWHERE) -> Any:
 
 
 def local(function: Callable[..., Any], mesh: Mesh | None, given: Any, returned: Any) -> Callable[..., Any]:
-    """`function` applied on each device to its own worlds; the layouts of what it is given and what it returns."""
+    """Apply `function` on each device to its own worlds; the specs lay out its arguments and results."""
     if mesh is None:
         return function
     return jax.shard_map(function, mesh=mesh, in_specs=given, out_specs=returned, check_vma=False)
 
 
 def put(tree: Any, mesh: Mesh | None, spec: Any) -> Any:
-    """Copies of host or device arrays on the mesh, laid out by the pytree `spec`; every process has all of them."""
+    """Put copies of host or device arrays on the mesh, laid out by the pytree `spec`; every process has all of them."""
     if mesh is None:
         return jax.tree.map(jax.numpy.copy, tree)
 

@@ -39,7 +39,7 @@ class Speed:
 def measure(
     env: Env, worlds: int, steps: int, seconds: float, now: Callable[[], float] = time.perf_counter, seed: int = 0
 ) -> Speed:
-    """The speed of rollouts of `steps` control steps, repeated for about `seconds`.
+    """Measure the speed of rollouts of `steps` control steps, repeated for about `seconds`.
 
     Args:
         env: any environment.

@@ -37,7 +37,7 @@ class TrainState:
     mesh: Mesh | None = None  # of the devices that share the worlds
 
     def replace(self, **changes: Any) -> TrainState:
-        """A copy with other fields."""
+        """Return a copy with other fields."""
         return dataclasses.replace(self, **changes)
 
     def tree_flatten_with_keys(self) -> tuple[list[tuple[GetAttrKey, Any]], Any]:
@@ -57,7 +57,7 @@ ARRAYS = tuple(name for name in FIELDS if name not in ("config", "extensions", "
 
 
 def policy_of(state: TrainState) -> Policy:
-    """The policy of a training state, with its normaliser; of several devices, as host arrays."""
+    """Make the policy of a training state, with its normaliser; of several devices, as host arrays."""
     config = state.config
     policy = Policy(
         actor=state.params["actor"],

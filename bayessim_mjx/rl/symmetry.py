@@ -39,7 +39,7 @@ class Copies:
 
 
 def mirrors(env: Env, groups: Iterable[str]) -> tuple[MirrorMap, ...]:
-    """The maps of the environment. UserError where it has none, or none for a group."""
+    """Find the maps of the environment. UserError where it has none, or none for a group."""
     maps = tuple(getattr(env, "mirrors", ()))
     name = getattr(env, "name", "") or type(env).__name__
     if not maps:
@@ -52,7 +52,7 @@ def mirrors(env: Env, groups: Iterable[str]) -> tuple[MirrorMap, ...]:
 
 
 def mirrored(x: jax.Array, part: SignedPermutation) -> jax.Array:
-    """The mirror image of x [..., n]."""
+    """Mirror x [..., n]."""
     return x[..., part[0]] * part[1]
 
 
@@ -62,7 +62,7 @@ def images(x: jax.Array, parts: Sequence[SignedPermutation]) -> jax.Array:
 
 
 def augmented(batch: Batch) -> Batch:
-    """The B samples of a minibatch and behind them their K copies: B (1 + K). What is for KL and entropy stays B.
+    """Append the K copies to the B samples of a minibatch: B (1 + K). What is for KL and entropy stays B.
 
     A copy was drawn by the mirrored policy, which tells how often it occurs: by its weight p(M a | M s) / p(a | s),
     held at 1, it counts as if the policy itself had drawn it. Without, what a policy far from symmetric would never do
@@ -142,7 +142,7 @@ class Symmetry(Extension):
     def loss(
         self, params: Params, batch: Batch, means: jax.Array, learner: Learner
     ) -> tuple[jax.Array | None, Figures]:
-        """The mirror loss; mean actions at the copies are known already where these are samples too."""
+        """Compute the mirror loss; mean actions at the copies are known already where these are samples too."""
         mean, copies = means[: len(batch.action)], batch.extra[NAME]
         if self.settings.use_data_augmentation:  # the copies are the first samples behind the batch
             mirrored = means[len(mean) : len(mean) * (1 + copies.value.shape[1])]

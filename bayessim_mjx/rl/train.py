@@ -41,7 +41,7 @@ LATEST = (
 
 
 def tags(config: PPOConfig) -> tuple[str, ...]:
-    """What an update reports under these settings."""
+    """List what an update reports under these settings."""
     return MEANS + LATEST + tuple(tag for e in catalogue.active(config) for tag in (*e.means, *e.latest))
 
 
@@ -110,7 +110,7 @@ def start(
 
 
 def _given(domain: Distribution | None, teacher: Policy | None, mesh: Mesh | None) -> tuple:
-    """What an update needs besides the state, the same on all devices."""
+    """List what an update needs besides the state, the same on all devices."""
     given = (domain,) if teacher is None else (domain, teacher)
     return given if mesh is None else sharding.agreed(given)
 
@@ -124,7 +124,7 @@ def run(
     progress: Callable[[Metrics, TrainState], None] | None = None,
     teacher: Policy | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """`iterations` more updates: the new state, and metrics of the last interval.
+    """Run `iterations` more updates: the new state, and metrics of the last interval.
 
     The host sees metrics every config.log_interval updates, Loss/* averaged over them.
 

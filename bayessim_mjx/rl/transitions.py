@@ -27,7 +27,7 @@ def statistics(config: PPOConfig, state: TrainState, data: dict) -> dict[str, no
 
 
 def batch(learner: Learner, state: TrainState, data: dict, normalizer: dict[str, normalise.Moments]) -> Batch:
-    """The collected [T, N] arrays as B = T N transitions with values, advantages and returns, computed once.
+    """Flatten the collected [T, N] arrays to B = T N transitions with values, advantages and returns, computed once.
 
     With a memory as N sequences of T steps instead, with ppo.segment as B / L segments of L steps. Observations are
     normalised by `normalizer`; the actions' probabilities are those of the policy that acted, by the state's. KL counts
@@ -105,13 +105,13 @@ def _attached(
     normalizer: dict[str, normalise.Moments],
     log_prob: jax.Array,
 ) -> dict[str, Any]:
-    """What extensions send into minibatches with the transitions, by name."""
+    """Collect what extensions send into minibatches with the transitions, by name."""
     found = {e.name: e.attach(state, data, normalizer, log_prob, learner) for e in learner.extensions}
     return {name: x for name, x in found.items() if x is not None}
 
 
 def _in_rows(learner: Learner, whole: Batch) -> Batch:
-    """The batch [T, N, ...] on every device, with one leading axis: transitions, sequences or segments."""
+    """Flatten the batch [T, N, ...] on every device to one leading axis: transitions, sequences or segments."""
     config = learner.config
     # where actor and critic see the same, it is sent to the devices once
     alike = learner.critic_group == "policy" and not config.memory

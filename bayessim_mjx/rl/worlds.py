@@ -75,7 +75,7 @@ def stagger(key: jax.Array, state: State, episode_length: int) -> tuple[State, j
 
 
 def aged(state: State, steps: jax.Array) -> State:
-    """The same worlds as if their episodes were `steps` `[N]` control steps old, for the time limit."""
+    """Return the same worlds as if their episodes were `steps` `[N]` control steps old, for the time limit."""
     steps = steps.astype(state.info["steps"].dtype)
     world = state.pipeline_state
     if "steps" in getattr(world, "task", {}):  # our tasks count in the world, the others in info

@@ -84,7 +84,7 @@ def collect(
 
 
 def strong(tree: Any) -> Any:
-    """The same arrays without weak types: what goes into the first update is then typed like what comes out of it."""
+    """Drop weak types: what goes into the first update is then typed like what comes out of it."""
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), tree)
 
 
@@ -154,5 +154,5 @@ def ring(worlds: int) -> int:
 
 
 def _stride(worlds: int) -> int:
-    """A step near the golden section of the pool and coprime with its size: visits every entry before repeating one."""
+    """Choose a step near the golden section of the pool and coprime with its size: no repeat before every entry."""
     return next(s for s in range(max(1, round(0.618 * worlds)), 0, -1) if math.gcd(s, worlds) == 1)

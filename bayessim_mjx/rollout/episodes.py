@@ -46,7 +46,7 @@ def select(mask: jax.Array, yes: Any, no: Any) -> Any:
 
 
 def as_pytree(policy_fn: PolicyFn) -> PolicyFn:
-    """The same function as a pytree, its arrays as leaves: new parameters are then new arguments, not a new program."""
+    """Make the function a pytree with arrays as leaves: new parameters are then new arguments, not a new program."""
     if inspect.ismethod(policy_fn) and not jax.tree_util.all_leaves([policy_fn.__self__]):
         return jax.tree_util.Partial(policy_fn.__func__, policy_fn.__self__)
     return jax.tree_util.Partial(policy_fn) if jax.tree_util.all_leaves([policy_fn]) else policy_fn
@@ -54,7 +54,7 @@ def as_pytree(policy_fn: PolicyFn) -> PolicyFn:
 
 @lru_cache(maxsize=64)
 def traced(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function (an environment's `reset` or `step`), written out once for all programs that it is part of."""
+    """Write out a function (an environment's `reset` or `step`) once for all programs that it is part of."""
     return jax.jit(function)
 
 

@@ -75,7 +75,7 @@ def started(
     around: Motion | None,
     drive: Drive = Drive(),  # noqa: B008  # immutable
 ) -> Any:
-    """The world theta [d] before the commands [T, nu], in the true state behind the measured qpos [nq], qvel [nv].
+    """Start the world theta [d] before the commands [T, nu], in the true state behind measured qpos [nq], qvel [nv].
 
     around: as in `replay`, of one start; None: the first command was held.
     """
@@ -92,7 +92,7 @@ def _throughout(physics: Physics, command: jax.Array) -> jax.Array:
 
 
 def recording(physics: Physics, qpos: jax.Array, qvel: jax.Array, command: jax.Array) -> Motion:
-    """The recording around starts, as `replay` takes it.
+    """Cut the recording around starts, as `replay` takes it.
 
     Args:
         physics: its sub-steps are what a command is held over.

@@ -62,7 +62,7 @@ def _digest(content: Any) -> str:
 
 
 def _whole(tree: Any) -> Any:
-    """The arrays that lie on devices of several processes, as host arrays; all of these processes have to save."""
+    """Gather arrays from devices of several processes as host arrays; all of these processes have to save."""
     import jax
     from jax.experimental.multihost_utils import process_allgather
 
@@ -106,7 +106,7 @@ def _leaves(tree: Any) -> list[tuple[str, Any]]:
 
 
 def _coordinates(tree: Any) -> dict[str, dict[str, Any]]:
-    """The `coordinates` of everything in the tree that has some, by dotted name: what its arrays do not tell."""
+    """Collect the `coordinates` in the tree by dotted name: its arrays do not hold them."""
     import jax
 
     def placed(node: Any) -> bool:
@@ -123,7 +123,7 @@ def _describe(name: str, array: np.ndarray) -> dict[str, Any]:
 
 
 def read_index(path: Path) -> dict[str, Any]:
-    """The index of the checkpoint `path`; CorruptedError where there is none."""
+    """Read the index of the checkpoint `path`; CorruptedError where there is none."""
     try:
         index = json.loads((path / INDEX).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
@@ -191,7 +191,7 @@ def has(path: Path, name: str) -> bool:
 
 
 def chart(path: Path, name: str) -> str | None:
-    """The chart of the distribution under the dotted `name`; None where the checkpoint does not tell (older ones)."""
+    """Read the chart of the distribution under the dotted `name`; None where the checkpoint has none (older ones)."""
     return read_index(path)["coordinates"].get(name, {}).get("chart")
 
 

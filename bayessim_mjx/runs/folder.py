@@ -73,7 +73,7 @@ class Run:
 
     @classmethod
     def open(cls, path: str | Path) -> "Run":
-        """An existing run folder; UserError where it is none or its manifest is damaged."""
+        """Open an existing run folder; UserError where it is none or its manifest is damaged."""
         return cls(Path(path), read(Path(path)))
 
     @property
@@ -92,7 +92,7 @@ class Run:
         return self.manifest["checkpoints"]
 
     def set_status(self, status: str, error: str | None = None) -> None:
-        """running, finished, interrupted (Ctrl-C) or failed (an `error`), also where the disk is full."""
+        """Set running, finished, interrupted (Ctrl-C) or failed (an `error`), also where the disk is full."""
         self.manifest.pop("error", None)
         self.manifest.update({"status": status} if error is None else {"status": status, "error": error})
         if status == "failed":
@@ -103,7 +103,7 @@ class Run:
             self._reserve()
 
     def changes(self) -> list[str]:
-        """What is not as it was when the run was started: settings that were edited, versions, the code's commit."""
+        """List what has changed since the run was started: settings that were edited, versions, the code's commit."""
         now, found = {"settings": self.config.to_dict(), "versions": versions(), "git": git_state()}, []
         for key, title in (("settings", ""), ("versions", "version of "), ("git", "git ")):
             then = self.manifest.get(key)
@@ -219,7 +219,7 @@ class Run:
 
 
 def find_runs(logdir: str | Path, task: str) -> list[Run]:
-    """Runs of a task, oldest first by the time in their manifests; folders without a readable one are passed over."""
+    """Find the runs of a task, oldest first by the time in their manifests; unreadable folders are passed over."""
     runs = []
     for file in (Path(logdir) / _folder_name(task)).glob(f"*/{MANIFEST}"):
         try:
@@ -230,7 +230,7 @@ def find_runs(logdir: str | Path, task: str) -> list[Run]:
 
 
 def latest_run(logdir: str | Path, task: str, with_checkpoint: bool = True) -> Run:
-    """The newest run of a task (that has a checkpoint)."""
+    """Find the newest run of a task (that has a checkpoint)."""
     runs = [run for run in find_runs(logdir, task) if run.checkpoints or not with_checkpoint]
     if not runs:
         raise UserError(

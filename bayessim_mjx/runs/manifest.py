@@ -13,7 +13,7 @@ FOLDER = "checkpoints"
 
 
 def read(path: Path) -> dict[str, Any]:
-    """The manifest in the folder `path`.
+    """Read the manifest in the folder `path`.
 
     Raises:
         UserError: there is none, it is damaged, or another version wrote it.
@@ -34,7 +34,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def _fault(manifest: Any) -> str | None:
-    """What is wrong with the contents of run.json; None: nothing."""
+    """Find what is wrong with the contents of run.json; None: nothing."""
     if not isinstance(manifest, dict):
         return "not an object"
     for key, kind in (("schema", int), ("task", str), ("created", str), ("status", str), ("checkpoints", list)):
@@ -77,7 +77,7 @@ def best_of(listed: Sequence[Mapping[str, Any]]) -> int | None:
 
 
 def advice(others: Sequence[Mapping[str, Any]]) -> str:
-    """What to do about a damaged checkpoint, where these others are left."""
+    """Advise what to do about a damaged checkpoint, where these others are left."""
     if not others:
         return "There is no other checkpoint: start the run again"
     return f"Use another checkpoint of the run: {', '.join(str(c['step']) for c in others)}"

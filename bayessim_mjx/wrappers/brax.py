@@ -15,7 +15,7 @@ __all__ = ["BraxEnv", "make_brax", "make_playground", "ours", "train"]
 
 
 def ours(task: Any, domain: Any = None, **env_settings: Any) -> Under:
-    """A task, or a run's task under its posterior (arguments as for `wrappers.worlds.worlds`), for Brax's trainers."""
+    """Make a task, or a run's task under its posterior (arguments as `wrappers.worlds.worlds`), for Brax's trainers."""
     return Under(*environment(task, domain, env_settings))
 
 

@@ -25,7 +25,7 @@ STORE, OURS = "fresh", "ours"  # in `info`: episodes to begin with; what our env
 
 
 def wrap(env: Env, episode_length: int | None = None, action_repeat: int = 1, randomization_fn: Any = None) -> Any:
-    """What Brax's trainers take as `wrap_env_fn`.
+    """Make what Brax's trainers take as `wrap_env_fn`.
 
     Args:
         env: an environment of ours; `Under(env, domain)` draws theta.

@@ -67,7 +67,7 @@ def make_vec(
 
 
 def _metadata(env: Env, render_mode: str | None) -> dict[str, Any]:
-    """What Gymnasium reads of an environment; UserError for a way of rendering that there is not."""
+    """List what Gymnasium reads of an environment; UserError for a way of rendering that there is not."""
     modes = list(RENDER_MODES) if hasattr(env, "physics") else []
     if render_mode is not None and render_mode not in modes:
         raise UserError(f"render_mode = {render_mode!r}: allowed: None{''.join(f', {m!r}' for m in modes)}")
@@ -120,7 +120,7 @@ class GymnasiumEnv(gymnasium.Env):
         self._state: Any = None
 
     def _begun(self, key: jax.Array, theta: jax.Array, now: Any) -> Any:
-        """A new episode; schedules go by the steps `now` of all episodes before it."""
+        """Begin a new episode; schedules go by the steps `now` of all episodes before it."""
         if getattr(self.env, "nuisance", None) is None:
             return self.env.reset(key, theta)
         return jax.tree.map(lambda x: x[0], reset_at(self.env, key, theta[None], None, now))
@@ -148,7 +148,7 @@ class GymnasiumEnv(gymnasium.Env):
         return observation, float(self._state.reward), terminated, truncated, metrics
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """The present state as `[HEIGHT, WIDTH, 3]` uint8 where `render_mode` is "rgb_array"."""
+        """Draw the present state as `[HEIGHT, WIDTH, 3]` uint8 where `render_mode` is "rgb_array"."""
         if self.render_mode is None or self._state is None:
             return None
         return self._camera(
@@ -218,7 +218,7 @@ class GymnasiumVectorEnv(VectorEnv):
     def _advanced(
         self, key: jax.Array, old: tuple, ended: jax.Array, action: jax.Array, domain: Any, given: tuple
     ) -> tuple[Any, tuple[Any, jax.Array]]:
-        """(what the step led to, (state, thetas) to go on from)."""
+        """Advance by one step: (what it led to, (state, thetas) to go on from)."""
         state, thetas = old
         after = jax.vmap(self.env.step)(state, action)
         if self.mode is DISABLED:
@@ -274,14 +274,14 @@ class GymnasiumVectorEnv(VectorEnv):
         return np.array(self._state.obs["policy"]), reward, terminated, truncated, info
 
     def _final(self, after: Any, ended: np.ndarray) -> dict[str, Any]:
-        """The last observations of the episodes that ended."""
+        """List the last observations of the episodes that ended."""
         final, last = np.empty(self.num_envs, object), np.array(after.info["final_observation"]["policy"])
         for i in np.flatnonzero(ended):
             final[i] = last[i]
         return {"final_obs": final, "_final_obs": ended, "final_info": {}, "_final_info": ended}
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
-        """A picture of each world, as `GymnasiumEnv.render`."""
+        """Draw a picture of each world, as `GymnasiumEnv.render`."""
         if self.render_mode is None or self._state is None:
             return None
         shown = self._state.pipeline_state.qpos, self._thetas, self._state.obs["policy"]

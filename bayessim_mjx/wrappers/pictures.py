@@ -58,7 +58,7 @@ def _scene(model: Any) -> _Scene:
 
 
 def _kept(store: OrderedDict[bytes, Any], key: bytes, most: int, make: Callable[[], Any]) -> Any:
-    """What `store` has for `key`, made where it is missing; the `most` that were asked for last stay."""
+    """Get what `store` has for `key`, made where it is missing; the `most` last ones requested stay."""
     if key not in store:
         store[key] = make()
         if len(store) > most:

@@ -30,7 +30,7 @@ OWN = ("ctrl_dt", "sim_dt", "episode_length", "action_repeat", "impl", "domain",
 
 
 def make(task: Any, domain: Any = None, **env_settings: Any) -> "PlaygroundEnv":
-    """A task, or a run's task under its posterior (arguments as for `wrappers.worlds.worlds`)."""
+    """Make a task, or a run's task under its posterior (arguments as for `wrappers.worlds.worlds`)."""
     return PlaygroundEnv(Under(*environment(task, domain, env_settings)))
 
 

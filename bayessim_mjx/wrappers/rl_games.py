@@ -77,7 +77,7 @@ class RlGamesVecEnv(IVecEnv):
 
 
 def settings(name: str, num_envs: int, epochs: int, folder: str = "logs/rl_games", **changes: Any) -> dict[str, Any]:
-    """What `Runner.load` takes, with which small tasks learn by PPO, in rl_games' names.
+    """Make what `Runner.load` takes, with which small tasks learn by PPO, in rl_games' names.
 
     Args:
         name: as registered.

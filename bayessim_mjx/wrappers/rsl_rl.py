@@ -65,7 +65,7 @@ class RslRlVecEnv(VecEnv):
         return self._groups(self.worlds.obs)
 
     def reset(self) -> tuple[TensorDict, dict]:
-        """New episodes in all worlds."""
+        """Begin new episodes in all worlds."""
         return self._groups(self.worlds.reset()), {}
 
     def step(self, actions: Any) -> tuple[TensorDict, Any, Any, dict]:
@@ -132,7 +132,7 @@ def mirrored(env: RslRlVecEnv, obs: Any = None, actions: Any = None) -> tuple[An
 
 
 def settings(symmetry: bool = False, rnd: float = 0.0, **changes: Any) -> dict[str, Any]:
-    """A runner's settings with which small tasks learn, in rsl_rl's names.
+    """Make a runner's settings with which small tasks learn, in rsl_rl's names.
 
     Args:
         symmetry: mirrored samples by the task's mirror maps (`mirrored`).

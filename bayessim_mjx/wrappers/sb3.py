@@ -78,7 +78,7 @@ class SB3VecEnv(VecEnv):
         pass
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """A picture `[height, width, 3]` of each world; None where no OpenGL works."""
+        """Draw a picture `[height, width, 3]` of each world; None where no OpenGL works."""
         shown = self.worlds.qpos, self.worlds.theta, self.worlds.obs["policy"]
         return [self._camera(*world) for world in zip(*map(np.asarray, shown), strict=True)]
 
@@ -112,6 +112,6 @@ class SB3VecEnv(VecEnv):
         return [None] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """True for SB3's `Monitor`, whose `episode` infos these worlds write."""
+        """Return True for SB3's `Monitor`, whose `episode` infos these worlds write."""
         rows: Iterable[int] = self._get_indices(indices)
         return [wrapper_class is Monitor for _ in rows]

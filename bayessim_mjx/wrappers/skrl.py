@@ -44,7 +44,7 @@ def wrapped(worlds: Worlds, library: str = "jax") -> Any:
 
 
 def _numbers(box: gymnasium.spaces.Box) -> gymnasium.spaces.Box:
-    """The box; that of bytes as one of float32 from 0 to 1, as skrl's models cannot take bytes."""
+    """Return the box; that of bytes as one of float32 from 0 to 1, as skrl's models cannot take bytes."""
     return box if box.dtype != np.uint8 else gymnasium.spaces.Box(0.0, 1.0, box.shape, np.float32)
 
 
@@ -78,7 +78,7 @@ class _Env:
         return _numbers(boxes(self.worlds.env, "critic")[0]) if "critic" in self.worlds.env.observation_size else None
 
     def reset(self) -> tuple[Any, dict]:
-        """New episodes the first time; after that the running ones, as they restart by themselves."""
+        """Begin new episodes the first time; after that return the running ones, as they restart by themselves."""
         if not self._begun:
             self._begun, self._obs = True, self.worlds.reset()
         return self._flat(self._obs["policy"]), {}
@@ -143,7 +143,7 @@ def _torch_env() -> type:
 
 
 def told_true_ends(agent: Any) -> Any:
-    """The agent of skrl, which learns of what each step led to in place of a new episode's first observation.
+    """Make skrl's agent learn of what each step led to in place of a new episode's first observation.
 
     Its PPO adds the value of that observation where a time limit ended an episode (`time_limit_bootstrap`). Nothing
     else changes: after an end no value of the next observation is used.
@@ -159,7 +159,7 @@ def told_true_ends(agent: Any) -> Any:
 
 
 def settings(timesteps: int, folder: str = "logs/skrl", **changes: Any) -> dict[str, Any]:
-    """Settings of skrl's `Runner` with which small tasks learn by PPO, in skrl's names.
+    """Make settings of skrl's `Runner` with which small tasks learn by PPO, in skrl's names.
 
     Args:
         timesteps: control steps of each world.

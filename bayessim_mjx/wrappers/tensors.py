@@ -12,7 +12,7 @@ from bayessim_mjx.errors import UserError
 
 
 def torch() -> Any:
-    """The module; UserError where it is not installed."""
+    """Import the module; UserError where it is not installed."""
     try:
         import torch as module
     except ImportError as error:
@@ -21,7 +21,7 @@ def torch() -> Any:
 
 
 def device_of(x: jax.Array) -> str:
-    """The name that PyTorch has for the device of `x`."""
+    """Name the device of `x` as PyTorch does."""
     device = x.devices().pop()
     return "cpu" if device.platform == "cpu" else f"cuda:{device.id}"
 
@@ -33,6 +33,6 @@ def to_torch(tree: Any) -> Any:
 
 
 def to_jax(tensor: Any, device: jax.Device | None = None) -> jax.Array:
-    """A copy of `tensor` as an array; it is moved where `device` is another one."""
+    """Copy `tensor` as an array; it is moved where `device` is another one."""
     x = jax.dlpack.from_dlpack(tensor.detach().clone().contiguous())
     return x if device is None or x.devices() == {device} else jax.device_put(x, device)

@@ -95,7 +95,7 @@ class Worlds:
         self._fixed: jax.Array | None = None  # theta [N, d] that `set_theta` gave
 
     def seed(self, seed: int) -> None:
-        """What is drawn from now on."""
+        """Seed what is drawn from now on."""
         # bound to its device as tensors of other libraries are: else the second step would be compiled again
         key = jax.random.PRNGKey(seed)
         self._key = jax.device_put(key, key.devices().pop())
@@ -113,7 +113,7 @@ class Worlds:
         self._fixed = jnp.broadcast_to(value, (self.num_envs, d))
 
     def set_lengths(self, steps: jax.Array) -> None:
-        """The running episodes are `steps` `[N]` old from now on, so that their time limits do not come all at once."""
+        """Set the age of the running episodes to `steps` `[N]`, so that their time limits do not come all at once."""
         if self._running is None:
             self.reset()
         old: _Running = self._running  # type: ignore[assignment]
@@ -121,7 +121,7 @@ class Worlds:
         self._running = old._replace(state=aged(old.state, steps), lengths=steps)
 
     def reset(self) -> Observations:
-        """New episodes in all worlds; their first observations, groups `[N, ...]`."""
+        """Begin new episodes in all worlds; return their first observations, groups `[N, ...]`."""
         self._key, key = jax.random.split(self._key)
         self._running = self._begin(key, self.domain, self._fixed)
         return self._running.state.obs
@@ -256,7 +256,7 @@ def environment(
 
 
 def domain_of(env: Env, source: Any) -> Distribution | None:
-    """The distribution over theta that `source` names (see `worlds`)."""
+    """Find the distribution over theta that `source` names (see `worlds`)."""
     if source is None or source == "nominal":
         return None
     if not isinstance(source, str | Path):
@@ -279,7 +279,7 @@ def domain_of(env: Env, source: Any) -> Distribution | None:
 
 
 def posterior_of(env: Env, checkpoint: Path, config: Any) -> Distribution | None:
-    """The posterior of a checkpoint of the loop, or that which PPO alone was trained on; None: neither."""
+    """Load the posterior of a checkpoint of the loop, or that which PPO alone was trained on; None: neither."""
     from bayessim_mjx.loop.posterior import restored
 
     found = restored(checkpoint, env, config)
@@ -287,7 +287,7 @@ def posterior_of(env: Env, checkpoint: Path, config: Any) -> Distribution | None
 
 
 def run_of(path: str | Path) -> tuple[Any, Path]:
-    """(settings, checkpoint with the last state) of a run or of one of its checkpoints."""
+    """Find (settings, checkpoint with the last state) of a run or of one of its checkpoints."""
     from bayessim_mjx.runs import MANIFEST, Run
 
     folder = Path(path).absolute()

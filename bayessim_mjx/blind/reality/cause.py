@@ -31,7 +31,7 @@ class Simulated(Protocol):
         """Of a joint in `data.qvel`."""
 
     def position(self, joint: str) -> float:
-        """True position of a joint, before any play behind it."""
+        """Give the true position of a joint, before any play behind it."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -56,7 +56,7 @@ def rivals(cause: Cause, ruler: Ruler, names: Sequence[str] = tuple(KNOWN)) -> l
 
 
 def apart(cause: Cause, name: str, where: str, ruler: Ruler) -> float:
-    """Encoder noises that the best cause of that name and place leaves of the motion with another one."""
+    """Measure what the best cause of that name and place leaves of another one's motion, in encoder noises."""
     runs = record(cause, ruler)
     gap = ruler.windows(ruler.plain, runs)
     left, rival = _best(name, where, cause.scales, ruler, runs, gap)
@@ -64,27 +64,27 @@ def apart(cause: Cause, name: str, where: str, ruler: Ruler) -> float:
 
 
 def _best(name: str, where: str, scales: Scales, ruler: Ruler, runs: list[Run], gap: np.ndarray) -> tuple[float, Cause]:
-    """(what it leaves, the closest draw)."""
+    """Find the closest draw: (noises that it leaves, the draw)."""
     rng = np.random.default_rng((ruler.seed, *name.encode()))
     each = [(_closest(rival, ruler, runs, gap), rival) for rival in _drawn(name, where, scales, rng)]
     return min(each, key=lambda r: r[0])
 
 
 def record(cause: Cause, ruler: Ruler) -> list[Run]:
-    """The runs that measure strength, with a cause and without noise."""
+    """Record the runs that measure strength, with a cause and without noise."""
     plant = Plant(ruler.system, ruler.base, [cause])
     return [ruler.system.record(plant, i, ruler.seed, noise=False) for i in ruler.system.pushed]
 
 
 def _joint(cause: Cause, ruler: Ruler, gap: np.ndarray) -> str:
-    """The cause's joint; of one at a body or the world the joint that shows most of it."""
+    """Find the cause's joint; of a cause at a body or the world the joint that shows most of it."""
     if cause.kind in ("joint", "actuator"):
         return cause.scales.drives.get(cause.where, cause.where)
     return ruler.plain.joints[int(np.argmax(np.mean(gap**2, axis=(0, 1))))]
 
 
 def _others(cause: Cause, ruler: Ruler, names: Sequence[str], near: str) -> list[tuple[str, str]]:
-    """What else may be wrong at this joint, its actuator, at bodies, the world and contacts; the same law elsewhere."""
+    """List other causes at this joint, its actuator, bodies, the world and contacts, and the same law elsewhere."""
     out, scales = [], cause.scales
     for name in names:
         for where in places(ruler.system, name, scales):
@@ -95,7 +95,7 @@ def _others(cause: Cause, ruler: Ruler, names: Sequence[str], near: str) -> list
 
 
 def _drawn(name: str, where: str, scales: Scales, rng: np.random.Generator) -> list[Cause]:
-    """A cause with some signs and shapes."""
+    """Draw a cause with some signs and shapes."""
     out = [CAUSES[name](where, scales, rng) for _ in range(DRAWS)]
     for shape in SHAPES.get(name, ()):
         out.append(CAUSES[name](where, scales, rng))
@@ -104,7 +104,7 @@ def _drawn(name: str, where: str, scales: Scales, rng: np.random.Generator) -> l
 
 
 def _closest(rival: Cause, ruler: Ruler, runs: list[Run], gap: np.ndarray) -> float:
-    """What the best size of a rival leaves, in noises."""
+    """Compute what the best size of a rival leaves, in noises."""
     either = any(hasattr(rival, a) for a in _SIGNED)
     smallest = max(rival.smallest, 1e-4 * rival.largest)
     rival.size, best = max(_FIRST * rival.largest, smallest), np.inf
@@ -136,7 +136,7 @@ def _scaled(ruler: Ruler, gap: np.ndarray, other: np.ndarray, either: bool) -> t
 
 
 def _refitted(rival: Cause, ruler: Ruler, runs: list[Run], gap: np.ndarray) -> float:
-    """What a rival leaves, in noises, once its size and the base parameters are refitted by simulation."""
+    """Compute what a rival leaves, in noises, once its size and the base parameters are refitted by simulation."""
     names, shift, best = list(ruler.base), np.zeros(len(ruler.base)), np.inf
     tangents, (low, high) = ruler.outside(ruler.tangents), ruler.bounds
     smallest = max(rival.smallest, 1e-4 * rival.largest)

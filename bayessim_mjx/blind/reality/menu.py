@@ -45,7 +45,7 @@ def places(system: Rig, effect: str, scales: Scales) -> list[str]:
 def draw_cause(
     effect: str | tuple[str, str], robot: Rig, scales: Scales, taken: Sequence[Cause], rng: np.random.Generator
 ) -> Cause:
-    """A cause of size 0 at a place (given with the effect, or drawn) that no other one has taken.
+    """Draw a cause of size 0 at a place (given with the effect, or drawn) that no other one has taken.
 
     Raises:
         ValueError: the effect makes no sense on this robot.

@@ -47,7 +47,7 @@ class Rig(Protocol):
     def pushed(self) -> Sequence[int]: ...
 
     def spec(self) -> mujoco.MjSpec:
-        """The nominal model, anew."""
+        """Make the nominal model anew."""
 
     def record(self, plant: "Plant", index: int, seed: int, noise: bool = True) -> "Run":
         """Run `index` on a plant of this rig."""
@@ -140,7 +140,7 @@ class Plant:
         return float(self.data.qpos[self.address(joint)])
 
     def link(self) -> tuple[np.ndarray, np.ndarray]:
-        """True positions and velocities of the links, behind rotor and play."""
+        """Compute true positions and velocities of the links, behind rotor and play."""
         q = self.data.qpos[self._q].copy()
         v = self.data.qvel[self._v].copy()
         for i, j, address, dof in self._play:
@@ -189,14 +189,14 @@ class Plant:
         mujoco.mj_step(self.model, self.data, count)
 
     def measure(self) -> tuple[np.ndarray, np.ndarray]:
-        """What encoders without noise show."""
+        """Return the readings of encoders without noise."""
         q, v = self.link()
         for cause in self.causes:
             cause.sense(self, q, v)
         return q, v
 
     def force(self) -> np.ndarray:
-        """The larger of what drives and what loads each of `joints` now, N m or N."""
+        """Return the larger of the driving and the loading force of each of `joints` now, N m or N."""
         d = self.data
         return np.maximum(np.abs(d.qfrc_actuator), np.abs(d.qfrc_bias))[self.dofs()]
 
@@ -283,7 +283,7 @@ def scales_of(plant: Plant, runs: Sequence[Run]) -> Scales:
 
 
 def _ends(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Moving bodies that carry no other, and the moving ones before them."""
+    """List moving bodies that carry no other, and the moving ones before them."""
     moving = [i for i in range(model.nbody) if model.body_weldid[i] != 0 and model.body_weldid[i] == i]
     leaves = [i for i in moving if i not in {int(model.body_parentid[k]) for k in moving}]
     found = {*leaves, *(int(model.body_parentid[i]) for i in leaves)}

@@ -78,11 +78,11 @@ class Replay:
         return self.load()
 
     def shortened(self, seconds: float = SHORT) -> "Replay":
-        """The same robot in the first seconds of every run."""
+        """Keep the first seconds of every run of the same robot."""
         return dataclasses.replace(self, takes=tuple(t.shortened(seconds) for t in self.takes))
 
     def record(self, plant: Plant, index: int, seed: int, noise: bool = True) -> Run:
-        """The log's commands again; where the plant would leave the log, a weak controller adds to them."""
+        """Repeat the log's commands; where the plant would leave the log, a weak controller adds to them."""
         take, rng = self.takes[index], np.random.default_rng((seed, index))
         kp, kd, driven = _lead(plant)
         driven = driven if take.led else []

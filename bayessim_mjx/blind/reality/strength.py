@@ -48,7 +48,7 @@ class Ruler:
         self.bounds = (np.minimum(1 - spread - scale, -1e-9), np.maximum(1 + spread - scale, 1e-9))
 
     def windows(self, plant: Plant, runs: Sequence[Run], shift: Sequence[np.ndarray] | None = None) -> np.ndarray:
-        """Simulated positions less recorded ones, `[windows, rows, n]`, in noises."""
+        """Subtract recorded from simulated positions, `[windows, rows, n]`, in noises."""
         dq, dv = shift or (0.0, 0.0)
         out = []
         starts = [(r, start) for r in runs for start in range(0, len(r.time) - self.rows, self.rows)]

@@ -89,7 +89,7 @@ class System:
         plant.advance(run.ctrl[row])
 
     def _plan(self, plant: Plant, index: int, seed: int) -> tuple[Callable[..., np.ndarray], np.ndarray, np.ndarray]:
-        """(controller of time, position and velocity; start state) of a run."""
+        """Plan a run: (controller of time, position and velocity; start state)."""
         model = plant.model
         _, profile, size, pace = RUNS[index]
         plan = np.random.default_rng((seed, index, 1))

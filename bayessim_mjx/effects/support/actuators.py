@@ -42,7 +42,7 @@ def at_rest(at: Site) -> dict[str, jax.Array]:
 
 
 def follow(at: Site, memory: Any, command: jax.Array, advance: Advance) -> tuple[Any, jax.Array]:
-    """The command `[substeps, nu]` with what follows it in its place, at rest at the first command of all.
+    """Replace the command `[substeps, nu]` by what follows it, at rest at the first command of all.
 
     Each sub-step applies the follower's mean over the sub-step, so that the impulse is exact.
     """

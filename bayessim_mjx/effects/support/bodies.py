@@ -44,7 +44,7 @@ def _arm(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray) -> jax.Array:
 
 
 def inertial_site(effect: "Effect", model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
-    """The site of bodies whose inertials change.
+    """Find the site of bodies whose inertials change.
 
     It refuses those whose mass matrix was compiled as diagonal, which an offset centre of mass would fill.
     """

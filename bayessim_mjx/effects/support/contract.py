@@ -60,7 +60,7 @@ def check(effect: "Effect", mj_model: mujoco.MjModel, model: "mjx.Model", subste
 
 
 def _ours(effect: "Effect", hook: str, call: Any) -> Any:
-    """What user's code gives; whatever it raises, also by `sys.exit`, is told with its line."""
+    """Run the user's code; report whatever it raises, also by `sys.exit`, with its line."""
     try:
         return call()
     except UserError:
@@ -81,7 +81,7 @@ def _line(effect: "Effect", error: BaseException) -> str:
 
 
 def _inputs(at: Site, mj_model: mujoco.MjModel) -> dict[str, Any]:
-    """A moving robot under a command, and the recording of one."""
+    """Make the inputs of hooks: a moving robot under a command, and the recording of one."""
     from mujoco import mjx
 
     rng, data = np.random.default_rng(0), mujoco.MjData(mj_model)
@@ -101,7 +101,7 @@ def _inputs(at: Site, mj_model: mujoco.MjModel) -> dict[str, Any]:
 
 
 def _called(effect: "Effect", at: Site, model: "mjx.Model", hook: str, theta: jax.Array, given: dict) -> tuple:
-    """(what the hook leaves as it is when it is off, what it gives for it)."""
+    """Call a hook: (what it leaves as it is when it is off, its result there)."""
     data, memory = given["data"], effect.init(at)
     shown = given["measurement"]
     step = SubStep(model, data, shown, at.timestep)

@@ -24,7 +24,7 @@ def collidable(model: mujoco.MjModel) -> np.ndarray:
 
 
 def touching(effect: "Effect", model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
-    """The site of an effect on geoms; "all": those that can touch something.
+    """Find the site of an effect on geoms; "all": those that can touch something.
 
     Raises:
         UserError: a geom that cannot touch anything.

@@ -23,7 +23,7 @@ def write_model(
     effects: Sequence[Effect] = (),
     values: Mapping[str, float] | None = None,
 ) -> tuple[mujoco.MjSpec, list[str]]:
-    """A copy of `spec` with parameters and effects written natively; it compiles.
+    """Write parameters and effects natively into a copy of `spec`; it compiles.
 
     Args:
         spec: of the nominal model; not changed.

@@ -58,7 +58,7 @@ class Quantity:
 
 
 def delay(high: float, grid: tuple[float, ...]) -> Quantity:
-    """A time by which something is late, s; up to three periods of the logs, and at least up to `high`."""
+    """Declare a time lag, s; up to three periods of the logs, and at least up to `high`."""
     periods = (0.0, 3.0)
     return Quantity(
         "delay", 0.0, 0.0, high, unit="s", per="period", reach=periods, grid=grid, at_least=True, remembered=True

@@ -16,7 +16,7 @@ from bayessim_mjx.parameters.attributes import suggest
 
 
 def listed(specs: Sequence[Mapping[str, Any]]) -> tuple[Effect, ...]:
-    """The effects of a list of {effect, where, further settings of the effect, parameters}.
+    """Read the effects of a list of {effect, where, further settings of the effect, parameters}.
 
     `effect` is what `effects.load` takes. `parameters` gives ranges, priors and nominal values, as in an effects.yaml:
     {parameter: {range, distribution, nominal, ...}}, below the name of each place where `where` is a list.
@@ -76,7 +76,7 @@ def stack(section: Mapping[str, Any], effects: Sequence[Effect] = ()) -> tuple[E
 
 
 def _ranged(effect: Effect, place: str, settings: Mapping[str, Any], path: str) -> Effect:
-    """The effect with other ranges and priors at one place."""
+    """Give the effect other ranges and priors at one place."""
     own = {p.attribute: p for block in effect.blocks() if block.place == place for p in block.parameters}
     changed = {}
     for label, setting in settings.items():

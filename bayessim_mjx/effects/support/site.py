@@ -77,7 +77,7 @@ class Site:
         return len(self.names)
 
     def values(self, theta: jax.Array) -> jax.Array:
-        """The effect's slice of theta as `[n, quantities]`, one row per element (the same row for all where tied)."""
+        """Slice the effect's part of theta `[n, quantities]`, one row per element (the same row for all where tied)."""
         rows = theta.reshape(-1, self.quantities)
         return jnp.broadcast_to(rows, (len(self), self.quantities))
 
@@ -87,7 +87,7 @@ class Site:
 
 
 def find(effect: Placed, model: mujoco.MjModel, timestep: float, substeps: int) -> Site:
-    """The site of `effect`; UserError where a place is not in the model or cannot carry it."""
+    """Find the site of `effect`; UserError where a place is not in the model or cannot carry it."""
     kind = effect.kind
     names = element_names(model, kind)
     usable = [i for i in range(len(names)) if _usable(model, kind, i)]
@@ -148,7 +148,7 @@ def _id(effect: Placed, place: str, names: list[str], usable: list[int]) -> int:
 
 
 def _joints(model: mujoco.MjModel, kind: str, ids: np.ndarray) -> np.ndarray:
-    """The joint of each element, -1 where there is none (bodies, geoms, actuators on tendons ...)."""
+    """Find the joint of each element, -1 where there is none (bodies, geoms, actuators on tendons ...)."""
     if kind == "joint":
         return ids
     if kind != "actuator":

@@ -85,7 +85,7 @@ def _moments(identified: Identified) -> dict[str, tuple[float, float]]:
 
 
 def _identified(p: Parameter, found: Mapping[str, tuple[float, float]]) -> Parameter:
-    """The parameter with nominal value and prior as identified, inside its range."""
+    """Set the parameter's nominal value and prior as identified, inside its range."""
     if p.name not in found:
         raise UserError(f"effects.yaml: no value of {p.name}; there are: {', '.join(found) or 'none'}")
     mean, sd = found[p.name]
@@ -137,7 +137,7 @@ def read(path: str | Path) -> Correction:
 
 
 def calibrated(specs: Iterable[Any]) -> tuple[Parameter, ...]:
-    """The parameters of a list `calibrated:`.
+    """Read the parameters of a list `calibrated:`.
 
     Raises:
         UserError: naming the entry, and what is wrong in it.
@@ -204,7 +204,7 @@ def _number(model: "mujoco.MjModel", p: Parameter) -> tuple[str, str, str | int]
 
 
 def _merged(own: Parameter, found: Parameter | None, model: "mujoco.MjModel") -> Parameter:
-    """The task's parameter with what was identified, in its own units."""
+    """Merge the task's parameter with what was identified, in the task's units."""
     if found is None:
         return own
     assert found.mean is not None and found.sd is not None

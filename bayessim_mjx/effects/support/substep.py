@@ -49,7 +49,7 @@ class SubStep:
         self._cache: dict[str, Any] = {} if asked is None else {"asked": asked}
 
     def seen_by(self, force: jax.Array, last: jax.Array) -> "SubStep":
-        """The same sub-step with the forces that one effect sees."""
+        """Return the same sub-step with the forces that one effect sees."""
         other = copy.copy(self)
         other.force, other.last = force, last
         return other
@@ -61,7 +61,7 @@ class SubStep:
         return self
 
     def within_a_branch(self) -> "SubStep":
-        """The same sub-step, whose derived values stay in the branch: those known already are shared."""
+        """Return the same sub-step, whose derived values stay in the branch; those known already are shared."""
         other = copy.copy(self)
         other._cache = dict(self._cache)
         return other

@@ -161,7 +161,7 @@ def _gains(at: Site, step: SubStep, on: jax.Array) -> tuple[jax.Array, jax.Array
 def recorded(
     at: Site, memory: Any, before: Mapping[str, jax.Array], after: Mapping[str, jax.Array], on: jax.Array
 ) -> dict[str, jax.Array]:
-    """The memory where the links are set to where they were recorded: the motors are moved along with them.
+    """Set the links to where they were recorded; the motors in memory are moved along with them.
 
     So a recording gives the motion of both, with its noise, and simulation the one of motors against links.
     """

@@ -51,7 +51,7 @@ def words(name: str) -> Words:
 
 
 def _law(kind: type[Effect]) -> str:
-    """What its motion must excite, by the docstring's first line; "" without a docstring of its own."""
+    """Name what its motion must excite, by the docstring's first line; "" without a docstring of its own."""
     text = inspect.cleandoc(kind.__doc__ or "").partition("\n")[0].rstrip(".")
     written = text and not text.startswith(f"{kind.__name__}(")  # a dataclass's own
     return f"a motion that excites its law, {text}" if written else ""

@@ -39,17 +39,17 @@ class Agent(Protocol):
         """Go on for so many iterations; what to log of the last one, by our tags."""
 
     def policy(self) -> Policy:
-        """The policy now, at its mean."""
+        """Return the policy now, at its mean."""
 
     def save(self, folder: Path) -> None:
         """Networks, optimizer and scales into an empty folder."""
 
     def load(self, folder: Path) -> None:
-        """What `save` wrote there; episodes begin anew."""
+        """Load what `save` wrote there; episodes begin anew."""
 
 
 def make(config: Config, env: Any, domain: Any) -> Agent:
-    """The agent that `config.agent` names, with the settings of `ppo:` in its library's terms.
+    """Make the agent that `config.agent` names, with the settings of `ppo:` in its library's terms.
 
     Raises:
         UserError: as `check`.
@@ -60,7 +60,7 @@ def make(config: Config, env: Any, domain: Any) -> Agent:
 
 
 def check(config: Config, env: Any) -> Any:
-    """The module of `config.agent`, where it can train on `env`; nothing is made yet.
+    """Check that `config.agent` can train on `env` and return its module; nothing is made yet.
 
     Raises:
         UserError: the library is not installed; a setting that its PPO has not; observations that are no vectors.

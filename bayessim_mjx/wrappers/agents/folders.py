@@ -8,7 +8,7 @@ NEW, OLD = ".new", ".old"  # versions of a folder, while one takes the other's p
 
 
 def write(folder: Path, save: Callable[[Path], None]) -> None:
-    """What `save` writes into an empty folder becomes `folder`, in place of what was there."""
+    """Write `save`'s files into an empty folder that then becomes `folder`, in place of what was there."""
     new, old = folder.with_suffix(NEW), folder.with_suffix(OLD)
     shutil.rmtree(new, ignore_errors=True)
     new.mkdir(parents=True)
@@ -20,7 +20,7 @@ def write(folder: Path, save: Callable[[Path], None]) -> None:
 
 
 def kept(folder: Path) -> Path:
-    """The folder, or its last version where a kill came before the new one was in its place."""
+    """Find the folder, or its last version where a kill came before the new one was in its place."""
     return folder if folder.is_dir() else folder.with_suffix(OLD)
 
 

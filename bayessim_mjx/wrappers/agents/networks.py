@@ -14,7 +14,7 @@ from bayessim_mjx.rl.normalise import EPSILON, Moments
 def policy(
     layers: Sequence[tuple[Any, Any]], log_std: Any, config: PPOConfig, mean: Any = None, scale: Any = None
 ) -> Policy:
-    """The policy that acts as the other library's network does at its mean.
+    """Make a policy that acts as the other library's network does at its mean.
 
     Args:
         layers: weights `[in, out]` and biases `[out]`, from the first to the last.
