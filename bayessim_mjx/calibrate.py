@@ -123,12 +123,12 @@ def verdict_lines(found: Any) -> list[str]:
 def write(folder: Path, found: Any, round_: int) -> Path:
     """report.json, and the picture as PNG and in TensorBoard at step `round_`, in place of an earlier one."""
     from bayessim_mjx import atomic
-    from bayessim_mjx.monitor import trust
+    from bayessim_mjx.monitor import plots
     from bayessim_mjx.monitor.writer import TensorBoard
 
     folder.mkdir(exist_ok=True)
     atomic.write_text(folder / "report.json", json.dumps({"round": round_, **found.to_dict()}, indent=1) + "\n")
-    picture = trust.calibration(found.calibration, round=round_, sets=found.sets)
+    picture = plots.calibration(found.calibration, round=round_, sets=found.sets)
     with TensorBoard(folder, purge_step={"Calibration": round_}, media=folder) as writer:
         writer.figure("Calibration/regions_and_ranks", picture, round_)
         writer.scalars(round_, found.scalars, prefix="Calibration/")

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
-from bayessim_mjx.config import cache
+from bayessim_mjx.config import loading
 from bayessim_mjx.config.settings import Config
 from bayessim_mjx.errors import UserError
 
@@ -99,10 +99,10 @@ def mesh_of(devices: Sequence[Any]) -> Any:
 
 def _cache(jax: Any, folder: str | None) -> None:
     """Compiled programs survive the process: a second start skips most of the compilation."""
-    chosen = folder or os.environ.get(cache.VARIABLE)
-    if chosen == cache.OFF:
+    chosen = folder or os.environ.get(loading.CACHE)
+    if chosen == loading.CACHE_OFF:
         return
-    path = Path(chosen or f"{cache.DEFAULT}/jax").expanduser()
+    path = Path(chosen or f"{loading.CACHE_DEFAULT}/jax").expanduser()
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

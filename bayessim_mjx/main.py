@@ -101,7 +101,7 @@ def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
 
 def _run(config: Config, run: Any, device: Any, command: Sequence[str], console: Any) -> int:
     from bayessim_mjx import loop, registry, runs
-    from bayessim_mjx.monitor.opening import opening
+    from bayessim_mjx.monitor.console import opening
 
     env = registry.make(config.task, config=config)
     console.start(opening(config, env, device))
@@ -128,7 +128,7 @@ def _run(config: Config, run: Any, device: Any, command: Sequence[str], console:
 def _state(parts: Any, run: Any, console: Any) -> tuple[Any, int | None]:
     """(state to begin with, second of the run's clock that its checkpoint lies at: -1 none yet, None a new run)."""
     from bayessim_mjx import loop
-    from bayessim_mjx.monitor.wall import marked
+    from bayessim_mjx.monitor.writers import marked
 
     state = loop.init(parts)
     if run is not None and run.checkpoints:

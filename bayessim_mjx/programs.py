@@ -21,7 +21,7 @@ from jax import export
 
 from bayessim_mjx import atomic, versions
 from bayessim_mjx.compat import compiler_options
-from bayessim_mjx.config import cache
+from bayessim_mjx.config import loading
 from bayessim_mjx.physics import Physics
 
 FOLDER = "programs"
@@ -66,7 +66,7 @@ class Kept:
         return jax.jit(flat, compiler_options=compiler_options())
 
     def _from_disk(self, name: str, leaves: list[Any], tree: Any) -> Any:
-        folder = cache.folder()
+        folder = loading.cache_folder()
         path = None if folder is None else folder / FOLDER / name
         try:
             exported = export.deserialize(bytearray(path.read_bytes())) if path is not None else None

@@ -52,7 +52,7 @@ class Training:
     def __init__(self, config: Config, env: Any, run: Any, console: Any, stop: cli.Stop):
         import jax
 
-        from bayessim_mjx.monitor.compile_clock import CompileClock
+        from bayessim_mjx.monitor.clock import CompileClock
         from bayessim_mjx.monitor.film import film
         from bayessim_mjx.wrappers.worlds import domain_of
 
@@ -67,7 +67,7 @@ class Training:
     def state(self, resume: bool) -> tuple[Any, int | None]:
         """(state to begin with, second of the run's clock that its checkpoint lies at: -1 none yet, None a new run)."""
         from bayessim_mjx import rl
-        from bayessim_mjx.monitor.wall import marked
+        from bayessim_mjx.monitor.writers import marked
 
         state = rl.start(self.env, self.config.ppo, self.key, self.domain, mesh(self.config), self.teacher)
         if resume and self.run.checkpoints:
@@ -77,8 +77,7 @@ class Training:
 
     def open(self, iteration: int, resumed_at: int | None) -> None:
         """Begin to write; on resume what lies after the checkpoint goes, as it is written again."""
-        from bayessim_mjx.monitor.wall import Wall
-        from bayessim_mjx.monitor.writers import opened
+        from bayessim_mjx.monitor.writers import Wall, opened
 
         path, late = self.run.path, None if resumed_at is None else {"cfg": 0, "": iteration + 1}
         more = self.config.monitor.writers
@@ -186,15 +185,15 @@ class AgentTraining(Training):
     """The same with another library's PPO: `state` is the agent, whose own files lie in `agent/` beside checkpoints."""
 
     def state(self, resume: bool) -> tuple[Any, int | None]:
-        from bayessim_mjx.monitor.wall import marked
+        from bayessim_mjx.monitor.writers import marked
         from bayessim_mjx.wrappers import agents
-        from bayessim_mjx.wrappers.agents import folders
+        from bayessim_mjx.wrappers.agents import shared
 
         agent = agents.make(self.config, self.env, self.domain)
         if not (resume and self.run.checkpoints):
             return agent, -1 if resume else None
         _, meta = self.run.restore("latest", {"policy": agent.policy()}, fall_back=True)
-        agent.load(folders.kept(self._folder(meta["iteration"])))
+        agent.load(shared.kept_folder(self._folder(meta["iteration"])))
         agent.iteration = meta["iteration"]
         return agent, marked(meta)
 
@@ -209,12 +208,12 @@ class AgentTraining(Training):
 
     def save(self, state: Any, evaluation: float | None = None) -> None:
         """Save a checkpoint, after the agent's own files; older ones go."""
-        from bayessim_mjx.wrappers.agents import folders
+        from bayessim_mjx.wrappers.agents import shared
 
         folder = self._folder(state.iteration)
-        folders.write(folder, state.save)
+        shared.write_folder(folder, state.save)
         super().save(state, evaluation)
-        folders.clear(folder.parent, {str(c["step"]) for c in self.run.checkpoints})
+        shared.clear_folders(folder.parent, {str(c["step"]) for c in self.run.checkpoints})
 
     def train(self, state: Any) -> Any:
         ppo = self.config.ppo
@@ -234,8 +233,7 @@ class AgentTraining(Training):
 
 def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> int:
     from bayessim_mjx import registry, runs
-    from bayessim_mjx.monitor.console import Console
-    from bayessim_mjx.monitor.opening import opening
+    from bayessim_mjx.monitor.console import Console, opening
 
     device = setup_jax(config)
     mesh(config)  # refuse before there is a run folder

@@ -43,10 +43,10 @@ def answer(check: Check, outcomes: Sequence[Outcome], say: Say | None = None) ->
 def write(check: Check, found: Found) -> None:
     """blind.json and the page."""
     atomic.write_text(check.folder / FILE, json.dumps(found, indent=1, default=float))
-    show.page(found, about(check, found), check.folder)
+    show.page(found, about(check), check.folder)
 
 
-def about(check: Check, found: Found) -> list[str]:
+def about(check: Check) -> list[str]:
     """Robot, logs, seed and entry, for the head of the page."""
     source = count(len(check.data), "log path") if check.data else "a menu of motions"
     entry = [f"entry: {check.command}"] if check.command else []

@@ -56,7 +56,7 @@ def make(check: Check, bench: Bench, item: Item) -> None:
     if sizes != [c.size for c in causes]:
         raw, left = bench.ruler.measure(record(causes[0], bench.ruler))
         effects = [{"raw": raw, "left": left}]
-    write_logs(given / "logs", bench.rig, plant, runs, bench.velocity, bench.effort, rng)
+    write_logs(given / "logs", bench.rig, runs, bench.velocity, bench.effort, rng)
     for cause, effect in zip(plant.causes, effects, strict=True):
         effect |= {"strength": min(effect["raw"], HIDDEN * effect["left"]), **hidden(cause)}
     truth = dataclasses.asdict(item) | {"seed": check.seed, "base": base, "effects": effects}
@@ -104,9 +104,7 @@ def _moved(rig: Rig, base: dict[str, float], causes: list[Cause], seed: int) -> 
     raise RuntimeError(f"{rig.name}: the motion does not stay finite under {[c.name for c in causes]}")
 
 
-def write_logs(
-    folder: Path, rig: Rig, plant: Plant, runs: list[Run], velocity: bool, effort: bool, rng: np.random.Generator
-) -> None:
+def write_logs(folder: Path, rig: Rig, runs: list[Run], velocity: bool, effort: bool, rng: np.random.Generator) -> None:
     """CSV files and their side YAMLs in the library's format (docs/logs.md)."""
     folder.mkdir(parents=True)
     names = Channels.of(rig.spec().compile())

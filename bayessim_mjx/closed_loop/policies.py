@@ -16,7 +16,7 @@ from bayessim_mjx.closed_loop import judge
 from bayessim_mjx.closed_loop.judge import Simulators
 from bayessim_mjx.config import Config
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.monitor.compile_clock import CompileClock
+from bayessim_mjx.monitor.clock import CompileClock
 from bayessim_mjx.monitor.writer import TensorBoard
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.runs import checkpoints

@@ -1,6 +1,6 @@
 """Settings: their defaults and limits (settings.py), and how files, flags and overrides are read (loading.py)."""
 
-from bayessim_mjx.config.effects_file import EFFECTS_SCHEMA, read_effects
+from bayessim_mjx.config.layers import EFFECTS_SCHEMA, read_effects
 from bayessim_mjx.config.loading import cfg_folder, from_dict, load, replace, task_file
 from bayessim_mjx.config.settings import (
     BayesSimConfig,

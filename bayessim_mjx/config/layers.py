@@ -7,20 +7,21 @@ from pathlib import Path
 from typing import Any
 
 from bayessim_mjx import trust
-from bayessim_mjx.config.effects_file import read_effects
-from bayessim_mjx.config.randomization import merge_task
 from bayessim_mjx.config.settings import (
     YAML_NAMES,
     BayesSimConfig,
     Config,
     EnvConfig,
+    Frozen,
     MonitorConfig,
     PPOConfig,
     RealConfig,
     Section,
     checked,
     coerce,
+    thaw,
 )
+from bayessim_mjx.config.yaml_text import read_yaml
 from bayessim_mjx.errors import UserError, nearest, unknown
 
 Layer = tuple[str, Mapping[str, Any], bool]  # where it comes from, nested values, is it a file (else flag or override)
@@ -30,6 +31,17 @@ SECTIONS: dict[str, type[Section]] = {
 TOP_KEYS = [YAML_NAMES.get(f.name, f.name) for f in dataclasses.fields(Config)]
 PAGE = "docs/settings.md"  # that lists all keys
 REAL_KEYS = ("weights", "means", "stds")
+EFFECTS_SCHEMA = 1
+EFFECTS_KEYS = ("schema", "effects", "calibrated")
+TASK_KEYS = ("randomize", "randomization_params")
+PARAMS = "task.randomization_params"
+NEW_GROUPS = ("option", "effects")  # which an override may add; what is in `effects` is for the effects to check
+RANDOMIZED_KEYS = (
+    "range", "operation", "distribution", "mean", "sd", "nominal", "include", "exclude", "factor", "unit", "schedule",
+    "schedule_steps", "num_buckets", "setup_only", "zero",
+)  # fmt: skip
+NUISANCE_KEYS = ("observations", "actions", "sim_params")  # noise: two numbers of their own meaning, nothing inferred
+OPERATIONS = ("scaling", "additive", "absolute")
 
 
 def merge(merged: dict[str, Any], raw: Mapping[str, Any], source: str, is_file: bool, declared: Mapping) -> None:
@@ -43,9 +55,12 @@ def merge(merged: dict[str, Any], raw: Mapping[str, Any], source: str, is_file: 
         elif key in SECTIONS or key == "task":
             if value is not None and not isinstance(value, Mapping):
                 raise UserError(f"{key} = {value!r} ({source}): expected a section of `key: value` lines")
-            write = merge_task if key == "task" else _merge_section
-            value = _one_length(value or {}, source) if key == "env" else value
-            write(merged.setdefault(key, {}), value or {}, source, is_file, key, declared)  # type: ignore[operator]
+            below = merged.setdefault(key, {})
+            if key == "task":
+                _merge_task(below, value or {}, source, is_file)
+            else:
+                value = _one_length(value or {}, source) if key == "env" else value
+                _merge_section(below, value or {}, source, is_file, key, declared)
         else:
             merged[key] = _field(Config, key, value, key, source)
     sizes = [(raw.get("env") or {}).get("numEnvs"), (raw.get("ppo") or {}).get("num_envs")]
@@ -152,3 +167,55 @@ def _dotted(key: str) -> list[str]:
     """Full names of the section keys that are called nearly `key`: the hint for a forgotten section."""
     names = {f.name: f"{s}.{f.name}" for s, cls in SECTIONS.items() for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     return [names[n] for n in nearest(key, names, 2, 0.7)]
+
+
+def read_effects(path: str | Path) -> dict[str, Any]:
+    """`effects` and `calibrated` of an effects.yaml (see `effects/storage.py`), not looked into."""
+    raw = read_yaml(path)
+    for key in raw:
+        if key not in EFFECTS_KEYS:
+            raise unknown(f"{path}: key", str(key), EFFECTS_KEYS)
+    if raw.get("schema") != EFFECTS_SCHEMA:
+        raise UserError(
+            f"{path}: schema = {raw.get('schema')!r}: expected schema: {EFFECTS_SCHEMA}, as a diagnosis writes"
+        )
+    return {key: raw.get(key) or [] for key in EFFECTS_KEYS[1:]}
+
+
+def _merge_task(merged: dict, raw: Mapping, source: str, is_file: bool) -> None:
+    """`task:`: a file gives the randomised parameters whole, an override changes what is there."""
+    for key, value in raw.items():
+        if key not in TASK_KEYS:
+            raise unknown(f"{source}: key", f"task.{key}", [f"task.{k}" for k in TASK_KEYS])
+        if key == "randomize":
+            merged[key] = coerce(value, bool, "task.randomize", source)
+        else:
+            value = coerce(value or {}, Frozen, f"task.{key}", source)
+            merged[key] = thaw(value) if is_file else _deep(merged.get(key, {}), value, f"task.{key}", source)
+            _check_ranges(merged[key], f"task.{key}", source)
+
+
+def _deep(base: Any, change: Any, path: str, source: str) -> Any:
+    if not isinstance(change, Mapping) or not isinstance(base, Mapping):
+        return thaw(change)
+    more = RANDOMIZED_KEYS if "range" in base else NEW_GROUPS if path == PARAMS else ()
+    allowed = list(dict.fromkeys([*base, *more]))
+    for key in change:
+        if key not in allowed and path.count(".") > 0 and not path.startswith(f"{PARAMS}.effects"):
+            raise unknown(f"{source}: key", f"{path}.{key}", [f"{path}.{k}" for k in allowed])
+    return {**base, **{k: _deep(base.get(k), v, f"{path}.{k}", source) for k, v in change.items()}}
+
+
+def _check_ranges(node: Any, path: str, source: str) -> None:
+    """Every `range` below `node` is [low, high] with low < high; other nonsense is the parameter space's to refuse."""
+    if not isinstance(node, Mapping):
+        return
+    if "range" in node:
+        low_high = coerce(node["range"], tuple[float, ...], f"{path}.range", source)
+        if len(low_high) != 2 or low_high[0] >= low_high[1]:
+            raise UserError(f"{path}.range = {list(low_high)} ({source}): expected [low, high] with low < high")
+        if node.get("operation", "scaling") not in OPERATIONS:
+            raise unknown(f"{source}: {path}.operation", str(node["operation"]), OPERATIONS)
+    for key, value in node.items():
+        if key not in NUISANCE_KEYS:
+            _check_ranges(value, f"{path}.{key}", source)

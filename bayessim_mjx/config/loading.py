@@ -8,19 +8,24 @@ the path of an effects.yaml, whose contents then are the setting.
 """
 
 import dataclasses
+import functools
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bayessim_mjx import outside_tasks
-from bayessim_mjx.config import foreign, rlpt
+from bayessim_mjx.config import foreign
 from bayessim_mjx.config.layers import SECTIONS, Layer, merge
 from bayessim_mjx.config.settings import Config, EnvConfig, Frozen, Section, freeze
 from bayessim_mjx.config.yaml_text import DEPTH, read_value, read_yaml
 from bayessim_mjx.errors import UserError
 
 DICT = "dict"  # the source of settings that are no file
+CACHE = "BAYESSIM_MJX_CACHE"
+CACHE_OFF = "off"
+CACHE_DEFAULT = "~/.cache/bayessim_mjx"
 
 
 def cfg_folder() -> Path:
@@ -88,8 +93,8 @@ def replace(config: Config, **sections: Any) -> Config:
 def _train_layer(path: str | Path) -> dict[str, Any]:
     """Read a --cfg_train file: a `ppo:` section alone, its keys bare, or `policy:` and `learn:` as BayesSimIG's."""
     raw = read_yaml(path)
-    if rlpt.is_one(raw):
-        return rlpt.read(raw, str(path))
+    if foreign.is_rlpt(raw):
+        return foreign.read_rlpt(raw, str(path))
     if "ppo" not in raw:
         return {"ppo": raw}
     if len(raw) > 1:
@@ -143,3 +148,43 @@ def _one_number_of_worlds(layers: Sequence[Layer]) -> None:
     if len(given) == 2 and len({str(value) for _, value in given.values()}) == 2:
         (a, (one, _)), (b, (two, _)) = given.items()
         raise UserError(f"{a} and {b} are one setting, but {one} and {two} give two numbers; give one of them")
+
+
+class OfFile:
+    """A class attribute, e.g. `randomization = OfFile("task")`: that entry of the class's file.
+
+    A subclass without a file of its own takes that of its nearest base class.
+
+    Args:
+        path: keys and indices that lead to the entry.
+
+    Raises:
+        AttributeError: on reading, where there is no file or no such entry.
+    """
+
+    def __init__(self, *path: str | int) -> None:
+        self.path = path
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        entry: Any = next((_contents(f) for f in (task_file(k.__name__) for k in owner.__mro__) if f.is_file()), None)
+        try:
+            for key in self.path:
+                entry = entry[key]
+        except (KeyError, IndexError, TypeError):
+            file = task_file(owner.__name__)
+            raise AttributeError(f"{owner.__name__} has no {self.name}: {file} gives none") from None
+        return entry
+
+
+@functools.cache
+def _contents(path: Path) -> Mapping[str, Any]:
+    return freeze(read_yaml(path))
+
+
+def cache_folder() -> Path | None:
+    """$BAYESSIM_MJX_CACHE, or ~/.cache/bayessim_mjx; None where the variable says off."""
+    chosen = os.environ.get(CACHE)
+    return None if chosen == CACHE_OFF else Path(chosen or CACHE_DEFAULT).expanduser()

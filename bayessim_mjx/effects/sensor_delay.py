@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
 from bayessim_mjx.effects.support.motion import Motion, between
 from bayessim_mjx.effects.support.quantity import delay
-from bayessim_mjx.effects.support.sensors import columns, written
-from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.site import Site, columns, written
 
 if TYPE_CHECKING:
     import mujoco

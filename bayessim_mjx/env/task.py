@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from bayessim_mjx.config.of_file import OfFile
+from bayessim_mjx.config.loading import OfFile
 from bayessim_mjx.config.settings import IMPLEMENTATIONS, implementation
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.support.reading import stack
@@ -19,7 +19,7 @@ from bayessim_mjx.env.protocol import Env, Observations, State
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import Mirror, resolve
 from bayessim_mjx.parameters import Parameter, ParameterSpace
-from bayessim_mjx.parameters.zeros import with_zeros
+from bayessim_mjx.parameters.checks import with_zeros
 from bayessim_mjx.physics import Physics, World, control_step, mjx
 from bayessim_mjx.physics.implementation import Choice, choose
 from bayessim_mjx.physics.nuisance import GRAVITY, Course, Drawn

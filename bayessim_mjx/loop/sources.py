@@ -23,7 +23,7 @@ from bayessim_mjx.keys import branch
 from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop.collection import POLICY_DEPENDENT, SummaryInputs, named, policy_function, summarise, tiled
 from bayessim_mjx.loop.recorded import Recorded, recorded
-from bayessim_mjx.parameters import ParameterSpace, limits
+from bayessim_mjx.parameters import ParameterSpace, ranged
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory, replay, rollout
 
@@ -264,9 +264,9 @@ def limits_of(env: Any) -> tuple[np.ndarray, np.ndarray]:
     """
     physics, model = getattr(env, "physics", None), getattr(env, "mj_model", None)
     if physics is None:
-        ends = [limits.ends(p) for p in env.space.parameters]
+        ends = [ranged.ends(p) for p in env.space.parameters]
     else:
-        ends = [limits.ends(p, model) for p in physics.blocks[0].parameters]
+        ends = [ranged.ends(p, model) for p in physics.blocks[0].parameters]
         for p, q in (pair for block in physics.blocks[1:] for pair in block.pairs()):
             ends.append((q.ends()[0], p.high if q.remembered else q.ends()[1]))
     low, high = np.asarray(ends, np.float64).reshape(-1, 2).T

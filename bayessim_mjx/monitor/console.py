@@ -5,20 +5,24 @@ broken at spaces, at the terminal's width or $COLUMNS; without either, what is s
 searched.
 """
 
+from __future__ import annotations
+
 import sys
 import time
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, TextIO
 
-from bayessim_mjx.monitor.bars import Bars
+from bayessim_mjx.config import Config
 from bayessim_mjx.monitor.clock import Clock
 from bayessim_mjx.monitor.names import named, shorten, spoken, without_prefix
-from bayessim_mjx.monitor.output import Output
+from bayessim_mjx.monitor.output import Bars, Output
 from bayessim_mjx.monitor.tables import TIE, fit
 from bayessim_mjx.quantities import compact, duration, estimate, is_number, spread
 
 WIDTHS = "posterior/prior sd"
+COMPILES = "the first start compiles its programs (about a minute on a CPU), later starts load them from the cache"
+NAMES = {"jax": "MJX's JAX implementation", "warp": "MuJoCo Warp"}
 
 
 class Console:
@@ -45,7 +49,7 @@ class Console:
         self._phase = ""
         self._showwarning = warnings.showwarning
 
-    def __enter__(self) -> "Console":
+    def __enter__(self) -> Console:
         """While inside, warnings meant for the user (UserWarning) become lines here, not Python's own noise."""
         before = self._showwarning = warnings.showwarning
 
@@ -229,3 +233,49 @@ class Console:
         if self.live:
             self._bars = self._bars or Bars(self._out.rich, self.width)
             self._bars.show(kind, text, total, done)
+
+
+def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[str, Any]:
+    """List {what: value} for `Console.start`; `infers`: the outer loop, else PPO alone."""
+    lines: dict[str, Any] = {"task": f"{config.task}, {'adaptive domain randomisation' if infers else 'PPO alone'}"}
+    if infers or config.randomization.get("randomize"):
+        lines["parameters"] = [_range(p) for p in env.space.parameters] or "none"
+    if config.domain is not None:
+        lines["drawn from"] = config.domain
+    if infers:
+        logs = ", ".join([config.real.logs] if isinstance(config.real.logs, str) else map(str, config.real.logs or ()))
+        lines["real side"] = f"recorded motion in {logs}" if logs else "surrogate: the simulator at hidden parameters"
+    lines["budget"] = _budget(config, infers)
+    if infers and config.bayessim.modelClass is not None:
+        lines["inference"] = _inference(config.bayessim)
+    lines["device"] = str(device)
+    if (chosen := getattr(env, "chosen", None)) is not None:
+        lines["physics"] = f"{NAMES[chosen.impl]}, taken by env.impl=auto: {chosen.why}"
+    lines |= {"seed": config.seed, "note": COMPILES}
+    return lines
+
+
+def _range(p: Any) -> str:
+    unit = f" {p.unit}" if p.unit else ""
+    return f"{p.name} {compact(p.low)} to {compact(p.high)}{unit}"
+
+
+def _budget(config: Config, infers: bool) -> str:
+    ppo, b = config.ppo, config.bayessim
+    steps = ppo.max_iterations * ppo.num_steps * ppo.num_envs
+    training = f"{ppo.max_iterations} PPO iterations × {ppo.num_envs} worlds × {ppo.num_steps} steps"
+    if not infers:
+        return f"{training} = {compact(steps)} steps"
+    whole = f"{b.realIters} rounds × ({training}) = {compact(b.realIters * steps)} steps"
+    if b.modelClass is None:
+        return f"{whole}; no inference (bayessim.modelClass=None)"
+    return f"{whole}; {b.trainTrajs} simulated trajectories per round to infer from"
+
+
+def _inference(b: Any) -> str:
+    """Network, summary and, where they are not the plain ones, coordinates, proposal and temperature."""
+    parts = [b.modelClass if b.ensemble == 1 else f"{b.ensemble} × {b.modelClass}", b.summarizerFxn]
+    parts += [f"{b.coordinates} coordinates"] if b.coordinates != "plain" else []
+    parts += [f"later rounds simulated from the posterior ({b.proposal})"] if b.proposal != "prior" else []
+    parts += [f"standard deviations times {b.temperature:g}"] if b.temperature not in (None, 1.0) else []
+    return ", ".join(parts)

@@ -14,12 +14,11 @@ from bayessim_mjx import atomic
 from bayessim_mjx.config import Config
 from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop import LoopState, RoundInfo
-from bayessim_mjx.monitor import plots, trust, video
-from bayessim_mjx.monitor.compile_clock import CompileClock
+from bayessim_mjx.monitor import plots, video
+from bayessim_mjx.monitor.clock import CompileClock
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.film import FPS, Motion, frames
-from bayessim_mjx.monitor.wall import Wall
-from bayessim_mjx.monitor.writers import Writer, opened
+from bayessim_mjx.monitor.writers import Wall, Writer, opened
 from bayessim_mjx.rl import Policy, policy_of
 
 MOST_PAIRS = 10  # BayesSimIG draws one figure per pair; beyond this the corner plot shows them all
@@ -169,7 +168,7 @@ class Session:
             return
         step, names = info.round + 1, posterior.space.names
         if info.checks is not None:
-            picture = trust.calibration(info.checks.calibration, round=step, sets=info.sets)
+            picture = plots.calibration(info.checks.calibration, round=step, sets=info.sets)
             self.inference.figure("BayesSim/calibration", picture, step)
         self.inference.figure("BayesSim/posterior", plots.corner(posterior, truth=info.truth, round=step), step)
         pairs = list(itertools.combinations(range(len(names)), 2))

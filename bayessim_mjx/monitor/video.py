@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.monitor import lettering
 from bayessim_mjx.monitor.rendering import render, warn_once
+from bayessim_mjx.quantities import compact
+
+STRIP = 16  # the strip's part of a picture's height is 1 / STRIP
+INK = (20, 20, 20)
 
 
 def record(
@@ -55,7 +58,7 @@ def record(
     marks = None if mocap is None else [np.asarray(mocap)[picked[0]]]
     worlds = [world[rows] for world, rows in zip(worlds, picked, strict=True)]
     texts = [overlay_text] if len(worlds) == 1 else list(overlay_text or [None] * len(worlds))
-    strip = 0 if captions is None else lettering.strip_of(height)
+    strip = 0 if captions is None else strip_of(height)
     try:
         tiles = render(mj_model, worlds, width, height - strip, camera, marks)
     except Exception as error:  # drivers fail in many ways, and a picture is never worth a run
@@ -65,9 +68,9 @@ def record(
         tiles = None
     if tiles is None:
         return None
-    frames = _grid([lettering.corner(tile, text) for tile, text in zip(tiles, texts, strict=True)])
+    frames = _grid([corner(tile, text) for tile, text in zip(tiles, texts, strict=True)])
     if captions is not None:
-        frames = lettering.underline(frames, strip, title, [captions[row] for row in picked[0]])
+        frames = underline(frames, strip, title, [captions[row] for row in picked[0]])
     if path is not None:
         save(frames, path, fps)
     return frames
@@ -149,3 +152,71 @@ def _mp4(frames: np.ndarray, path: Path, fps: float) -> None:
     # Not imageio_ffmpeg.write_frames: it forks (preexec_fn), which JAX's threads do not survive for sure.
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *target]
     subprocess.run(command, input=even.tobytes(), check=True, capture_output=True)
+
+
+def strip_of(height: int) -> int:
+    """Pixels of a picture of `height` that the strip takes."""
+    return height // STRIP
+
+
+def _font(size: int) -> Any:
+    import matplotlib
+    from PIL import ImageFont
+
+    return ImageFont.truetype(os.path.join(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf"), size)
+
+
+def corner(frames: np.ndarray, text: str | Mapping | Sequence | None) -> np.ndarray:
+    """Write `text` on a light ground into the upper left corner, as many lines as leave the robot in sight."""
+    if not text:
+        return frames
+    from PIL import Image, ImageDraw
+
+    height, width = frames.shape[1:3]
+    size = max(10, height // 26)
+    font, place = _font(size), (size // 2, size // 3)
+    lines = _lines(text)
+    fit = max(2, int(0.4 * height / (1.3 * size)))
+    words = "\n".join(lines if len(lines) <= fit else [*lines[: fit - 1], f"… {len(lines) - fit + 1} more"])
+    box = ImageDraw.Draw(Image.new("RGB", (1, 1))).multiline_textbbox(place, words, font=font)
+    area = (slice(0, min(height, int(box[3]) + size // 2)), slice(0, min(width, int(box[2]) + size // 2)))
+    frames = frames.copy()
+    for frame in frames:
+        ground = Image.fromarray((0.25 * frame[area] + 0.75 * 255).astype(np.uint8))
+        ImageDraw.Draw(ground).multiline_text(place, words, font=font, fill=INK)
+        frame[area] = np.asarray(ground)
+    return frames
+
+
+def underline(frames: np.ndarray, strip: int, title: str, captions: Sequence[str]) -> np.ndarray:
+    """Frames above a white strip with the title to the left and each frame's caption to the right.
+
+    Args:
+        frames: [T, H, W, 3] uint8.
+        strip: its height in pixels.
+        title: the same on all frames.
+        captions: [T], one per frame.
+    """
+    from PIL import Image, ImageDraw
+
+    length, height, width, _ = frames.shape
+    size, edge = max(9, int(0.6 * strip)), strip // 2
+    widest = max(captions, key=len)
+    while size > 6 and _font(size).getlength(f"{title}   {widest}") > width - 2 * edge:
+        size -= 1
+    font = _font(size)
+    start = width - edge - font.getlength(widest)  # the same for all, so that nothing jumps
+    out = np.full((length, height + strip, width, 3), 255, np.uint8)
+    for k, caption in enumerate(captions):
+        ground = Image.new("RGB", (width, strip), "white")
+        draw = ImageDraw.Draw(ground)
+        draw.text((edge, strip // 2), title, font=font, fill=INK, anchor="lm")
+        draw.text((start, strip // 2), caption, font=font, fill=INK, anchor="lm")
+        out[k, :height], out[k, height:] = frames[k], np.asarray(ground)
+    return out
+
+
+def _lines(text: str | Mapping | Sequence) -> list[str]:
+    if isinstance(text, Mapping):
+        return [f"{k} {compact(v, 3)}" if isinstance(v, float | np.floating) else f"{k} {v}" for k, v in text.items()]
+    return text.splitlines() if isinstance(text, str) else [str(line) for line in text]

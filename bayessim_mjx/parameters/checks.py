@@ -1,4 +1,7 @@
-"""Checks of a `randomization_params` section: each error names the key's path, its value and what is allowed."""
+"""Checks of a `randomization_params` section: each error names the key's path, its value and what is allowed.
+
+`with_zeros` puts in what a task's scaling takes for numbers that are 0 in the model.
+"""
 
 import difflib
 from collections.abc import Mapping, Sequence
@@ -54,3 +57,26 @@ def number(value: Any, where: str) -> float:
         infinite = isinstance(value, float)
         raise UserError(f"{where}: {value!r} is not {'finite' if infinite else 'a number'}")
     return found
+
+
+def with_zeros(section: Mapping[str, Any], zeros: Mapping[str, float]) -> Mapping[str, Any]:
+    """Give joints' attributes their `zero` in a `randomization_params`, where they do not say another.
+
+    Args:
+        section: not changed.
+        zeros: {attribute of dof_properties: what scaling takes for a number that is 0 in the model}.
+    """
+
+    def with_zero(setting: Any, zero: float) -> Any:
+        return {"zero": zero, **setting} if isinstance(setting, Mapping) else setting
+
+    def inner(groups: Any) -> Any:
+        dofs = groups.get("dof_properties") if isinstance(groups, Mapping) else None
+        if not isinstance(dofs, Mapping):
+            return groups
+        return {**groups, "dof_properties": {a: with_zero(s, zeros[a]) if a in zeros else s for a, s in dofs.items()}}
+
+    actors = section.get("actor_params")
+    if not zeros or not isinstance(actors, Mapping):
+        return section
+    return {**section, "actor_params": {actor: inner(groups) for actor, groups in actors.items()}}

@@ -18,8 +18,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import attributes, checks, elements, geometry
 from bayessim_mjx.parameters.attributes import COMPOSITE, FIELDS, suggest
 from bayessim_mjx.parameters.elements import Element
-from bayessim_mjx.parameters.parameter import OPERATIONS, Parameter
-from bayessim_mjx.parameters.schedule import Schedule
+from bayessim_mjx.parameters.parameter import OPERATIONS, Parameter, Schedule
 
 SECTION_KEYS = ("frequency", "observations", "actions", "sim_params", "actor_params", "option", "effects")
 GROUPS: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -129,7 +128,7 @@ def _group(
         seen = list(dict.fromkeys(e for a in content for e in members[a]))
         pairs = [(e, a) for e in sorted(seen, key=available.index) for a in content if e in members[a]]
     for e, a in pairs:
-        yield _parameter(model, e, kind, a, content[a], f"{where}.{a}")
+        yield _parameter(model, e, a, content[a], f"{where}.{a}")
 
 
 def _selected(
@@ -162,9 +161,7 @@ def _selected(
     return usable
 
 
-def _parameter(
-    model: mujoco.MjModel, e: Element, kind: str, attribute: str, setting: Mapping[str, Any], where: str
-) -> Parameter:
+def _parameter(model: mujoco.MjModel, e: Element, attribute: str, setting: Mapping[str, Any], where: str) -> Parameter:
     operation = checks.choice(setting, "operation", OPERATIONS, "scaling", where)
     name = f"{e.label}_{attribute}".lstrip("_") + ("_mult" if operation == "scaling" else "")
     axis = None
@@ -172,18 +169,23 @@ def _parameter(
         kind, target = "body", elements.body_of(model, e)
         axis = geometry.long_axis(model, attributes.element(model, "body", target), f"{where}, {e.label}")
     else:
-        target = e.target
+        kind, target = e.kind, e.target
     kind, attribute, target = _driven(model, kind, attribute, target, operation)
     factor = checks.number(setting.get("factor", 1.0), f"{where}.factor")
     unit = "" if operation == "scaling" else str(setting.get("unit", _unit(model, kind, attribute, target)))
-    if operation == "scaling" and "zero" in setting and own_value(model, kind, attribute, target) == 0:
+    default = own_value(model, kind, attribute, target)
+    if operation == "scaling" and "zero" in setting and default == 0:
         operation, factor = "absolute", checks.number(setting["zero"], f"{where}.zero")
-    _check_default(model, kind, attribute, target, operation, f"{where}, {e.label or kind}")
+    place = f"{where}, {e.label or kind}"
+    if attribute.startswith("com_"):
+        attributes.refuse_simple(model, attributes.element(model, kind, target), place)
+    _check_default(default, kind, attribute, operation, place)
+    neutral = 1.0 if operation == "scaling" else 0.0  # theta at which the model stays as it is
     return _build(
         setting,
         where,
         name,
-        _own(model, kind, attribute, target, operation, factor),
+        default / factor if operation == "absolute" else neutral,
         unit=unit,
         operation=operation,
         attribute=attribute,
@@ -233,13 +235,6 @@ def _unit(model: mujoco.MjModel, kind: str, attribute: str, target: str) -> str:
     return unit
 
 
-def _own(model: mujoco.MjModel, kind: str, attribute: str, target: str, operation: str, factor: float) -> float:
-    """theta at which the model stays as it is."""
-    if operation == "absolute":
-        return own_value(model, kind, attribute, target) / factor
-    return 1.0 if operation == "scaling" else 0.0
-
-
 def own_value(model: mujoco.MjModel, kind: str, attribute: str, target: str) -> float:
     """Return the model's own number; restitution counts as 0, lengths and scales as 1."""
     if kind == "option":
@@ -257,10 +252,7 @@ def own_value(model: mujoco.MjModel, kind: str, attribute: str, target: str) -> 
     return float(np.asarray(getattr(model, names[attribute])[attributes.element(model, kind, target)]).reshape(-1)[0])
 
 
-def _check_default(model: mujoco.MjModel, kind: str, attribute: str, target: str, operation: str, where: str) -> None:
-    default = own_value(model, kind, attribute, target)
-    if attribute.startswith("com_"):
-        attributes.refuse_simple(model, attributes.element(model, kind, target), where)
+def _check_default(default: float, kind: str, attribute: str, operation: str, where: str) -> None:
     if operation == "scaling" and default == 0:
         advice = "use additive, exclude it, or give what stands for it: `zero: NUMBER`"
         raise UserError(f"{where}: scaling a number that is 0 in the model does nothing; {advice}")

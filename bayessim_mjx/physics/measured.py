@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx.config import cache
+from bayessim_mjx.config import loading
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.quantities import compact
 from bayessim_mjx.versions import of
@@ -49,7 +49,7 @@ def rate(value: float) -> str:
 
 def path() -> Path | None:
     """Where measurements are kept; None: they are not."""
-    folder = cache.folder()
+    folder = loading.cache_folder()
     return None if folder is None else folder / FILE
 
 

@@ -17,8 +17,8 @@ from bayessim_mjx.config.foreign import SIM_PARAMS
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.keys import branch
 from bayessim_mjx.parameters import ParameterSpace, checks
+from bayessim_mjx.parameters.parameter import OVER, Schedule
 from bayessim_mjx.parameters.reading import PATH
-from bayessim_mjx.parameters.schedule import OVER, Schedule
 
 DISTRIBUTIONS = ("gaussian", "uniform", "loguniform")
 OPERATIONS = ("additive", "scaling")

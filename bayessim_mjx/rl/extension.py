@@ -15,8 +15,8 @@ from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.rl import normalise
-from bayessim_mjx.rl.batch import Batch
 from bayessim_mjx.rl.networks import Params
+from bayessim_mjx.rl.segments import Batch
 from bayessim_mjx.rl.sharding import EVERYWHERE
 from bayessim_mjx.rl.state import TrainState
 

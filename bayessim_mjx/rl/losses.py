@@ -13,9 +13,9 @@ from jax.sharding import Mesh
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.rl import actions, networks, segments, sharding
-from bayessim_mjx.rl.batch import Batch
 from bayessim_mjx.rl.extension import Learner
 from bayessim_mjx.rl.networks import Params
+from bayessim_mjx.rl.segments import Batch
 
 MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2  # bounds of the adaptive schedule
 RATE_FACTOR = 1.5

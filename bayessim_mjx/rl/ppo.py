@@ -15,9 +15,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bayessim_mjx.compat import program
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.rl import actions, catalogue, episodes, losses, networks, normalise, sharding, transitions, worlds
-from bayessim_mjx.rl.batch import Batch
 from bayessim_mjx.rl.checks import check
 from bayessim_mjx.rl.extension import Learner, Sizes
+from bayessim_mjx.rl.segments import Batch
 from bayessim_mjx.rl.sharding import EVERYWHERE, FIRST
 from bayessim_mjx.rl.state import TrainState
 from bayessim_mjx.rollout import strong

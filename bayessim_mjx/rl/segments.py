@@ -1,7 +1,8 @@
-"""Advantages over segments of a few steps that every minibatch estimates anew, with the critic of that moment.
+"""One batch as the losses see it, and advantages over segments of a few steps that every minibatch estimates anew.
 
-As Brax does. The critic that collected is a whole update old at the last minibatch; and a short segment rests on the
-critic after a few steps, where rewards summed up further vary more. Measured on ant: benchmarks/history.md.
+With the critic of that moment, as Brax does. The critic that collected is a whole update old at the last minibatch; and
+a short segment rests on the critic after a few steps, where rewards summed up further vary more. Measured on ant:
+benchmarks/history.md.
 """
 
 import dataclasses
@@ -62,3 +63,21 @@ def renewed(params: networks.Params, batch: Any, config: PPOConfig) -> tuple[Any
     estimates = gae(future.reward.T, value.T, following.T, *ends, config.gamma, config.gae_lambda, config.segment)
     advantage, returns = (jax.lax.stop_gradient(x.T).reshape(-1) for x in estimates)
     return dataclasses.replace(flat, advantage=advantage, returns=returns), values
+
+
+@struct.dataclass
+class Batch:
+    """B transitions; observations normalised by statistics that include them."""
+
+    observation: jax.Array  # [B, S]
+    critic_observation: Any  # [B, S'] array
+    action: jax.Array  # [B, A] unclipped sample
+    mean: jax.Array  # [B, A] of the policy before learning
+    log_prob: jax.Array  # [B] by the policy that collected: with older statistics
+    value: jax.Array  # [B]
+    advantage: jax.Array  # [B]
+    returns: jax.Array  # [B]
+    log_std: jax.Array | None = None  # [B, A] like the mean, where it depends on the state
+    extra: dict[str, Any] = struct.field(default_factory=dict)  # by extension: what it attached, [B, ...]
+    weight: jax.Array | None = None  # [B] in the surrogate's mean, where an extension gave some
+    future: Future | None = None  # where ppo.segment is: all arrays are then segments [B / L, L, ...]

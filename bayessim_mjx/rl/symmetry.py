@@ -14,9 +14,9 @@ from bayessim_mjx.config import PPOConfig, SymmetryConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import MirrorMap, SignedPermutation
 from bayessim_mjx.rl import actions, networks, normalise
-from bayessim_mjx.rl.batch import Batch
 from bayessim_mjx.rl.extension import Extension, Figures, Learner
 from bayessim_mjx.rl.networks import Params
+from bayessim_mjx.rl.segments import Batch
 from bayessim_mjx.rl.state import TrainState
 
 if TYPE_CHECKING:

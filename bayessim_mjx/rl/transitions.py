@@ -9,9 +9,9 @@ import jax.numpy as jnp
 
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.rl import actions, networks, normalise, recurrent, segments, sharding
-from bayessim_mjx.rl.batch import Batch
 from bayessim_mjx.rl.extension import Learner
 from bayessim_mjx.rl.gae import gae
+from bayessim_mjx.rl.segments import Batch
 from bayessim_mjx.rl.state import TrainState
 
 

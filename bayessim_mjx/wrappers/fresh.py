@@ -16,7 +16,7 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env, State
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.keys import branch
-from bayessim_mjx.parameters.schedule import OVER
+from bayessim_mjx.parameters.parameter import OVER
 from bayessim_mjx.rl.worlds import clock, drawn, reset_at
 from bayessim_mjx.rollout import next_episodes, select
 from bayessim_mjx.wrappers.under import Under

@@ -21,8 +21,8 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics.warp import OVERFLOW, refuse_overflow
 from bayessim_mjx.rl.worlds import clock, held, reset_at
 from bayessim_mjx.rollout import next_episodes, select
+from bayessim_mjx.wrappers.conversion import boxes
 from bayessim_mjx.wrappers.pictures import Camera
-from bayessim_mjx.wrappers.spaces import boxes
 from bayessim_mjx.wrappers.worlds import domain_of
 
 RENDER_MODES = ("rgb_array",)

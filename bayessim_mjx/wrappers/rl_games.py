@@ -7,8 +7,7 @@ Tensors share memory with the worlds. `infos["time_outs"]` says whose episode a 
 from typing import Any
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.wrappers.spaces import boxes
-from bayessim_mjx.wrappers.tensors import to_jax, to_torch
+from bayessim_mjx.wrappers.conversion import boxes, to_jax, to_torch
 from bayessim_mjx.wrappers.worlds import Worlds, worlds
 
 try:

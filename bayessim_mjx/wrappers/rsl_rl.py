@@ -9,7 +9,7 @@ the step led to.
 from typing import Any
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.wrappers.tensors import device_of, to_jax, to_torch, torch
+from bayessim_mjx.wrappers.conversion import device_of, to_jax, to_torch, torch
 from bayessim_mjx.wrappers.worlds import Batch, Worlds, worlds
 
 try:

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.wrappers.conversion import boxes
 from bayessim_mjx.wrappers.pictures import Camera
-from bayessim_mjx.wrappers.spaces import boxes
 from bayessim_mjx.wrappers.worlds import Worlds, worlds
 
 try:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.wrappers.spaces import boxes
+from bayessim_mjx.wrappers.conversion import boxes
 from bayessim_mjx.wrappers.worlds import Worlds, worlds
 
 try:
@@ -126,7 +126,7 @@ class _JaxEnv(_Env):
 
 
 def _torch_env() -> type:
-    from bayessim_mjx.wrappers.tensors import device_of, to_jax, to_torch, torch
+    from bayessim_mjx.wrappers.conversion import device_of, to_jax, to_torch, torch
 
     class TorchEnv(_Env):
         @property

@@ -52,7 +52,7 @@ def make(robot: System, kind: str, seed: int, out: Path) -> bool:
     if kind == "coloured":
         runs = [coloured(robot, r, rng) for r in runs]
     given = case / "given"
-    write_logs(given / "logs", robot, plant, runs, bool(rng.uniform() < 0.5), False, rng)
+    write_logs(given / "logs", robot, runs, bool(rng.uniform() < 0.5), False, rng)
     (given / "model.xml").write_text(robot.xml)
     truth = {"version": VERSION, "robot": robot.name, "kind": kind, "seed": seed, "base": base, "effects": effects}
     code = seal.close(truth | {"salt": seal.digest(rng.bytes(32))}, given, out / "sealed" / f"{name}.json")

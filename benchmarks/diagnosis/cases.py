@@ -12,10 +12,9 @@ from systems import SYSTEMS
 
 from bayessim_mjx.blind.reality.cause import Cause
 from bayessim_mjx.blind.reality.menu import CAUSES, UNKNOWN, draw_cause, places
-from bayessim_mjx.blind.reality.motion import RUNS
 from bayessim_mjx.blind.reality.plant import Plant, Run, base_parameters, scales_of
 from bayessim_mjx.blind.reality.strength import Ruler, resize
-from bayessim_mjx.blind.reality.system import System
+from bayessim_mjx.blind.reality.system import RUNS, System
 
 __all__ = ["CAUSES", "KNOWN", "STRENGTHS", "SYSTEMS", "UNKNOWN", "Case", "draw_cause", "make_case", "places"]
 

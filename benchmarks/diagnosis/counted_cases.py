@@ -53,10 +53,9 @@ from turns import jobs
 
 from bayessim_mjx.blind.reality.cause import Cause
 from bayessim_mjx.blind.reality.lookalikes import APART, isolable, record, rivals
-from bayessim_mjx.blind.reality.motion import RUNS
 from bayessim_mjx.blind.reality.plant import Plant, Run, base_names, scales_of
 from bayessim_mjx.blind.reality.strength import Ruler, resize
-from bayessim_mjx.blind.reality.system import System
+from bayessim_mjx.blind.reality.system import RUNS, System
 
 SMALL, LARGE = ("pendulum", "cartpole", "two_link"), ("leg", "arm_servo", "arm_torque")
 SEEDS = {**dict.fromkeys(SMALL, range(9300, 9315)), **dict.fromkeys(LARGE, range(9300, 9310))}

@@ -19,6 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import real_logs as source
 from scipy.optimize import least_squares
 from scipy.signal import butter, filtfilt
 
@@ -34,9 +35,6 @@ from bayessim_mjx.effects import load
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Drive, Physics, begin, control_step
-
-sys.path.insert(0, str(Path(__file__).parent))
-import real_logs as source  # noqa: E402
 
 STEP = 0.001  # s, the rate of EMPS
 CUTOFF = 20.0  # Hz, zero-phase: motion and force of EMPS alike

@@ -10,8 +10,7 @@ import mujoco
 import numpy as np
 from systems import SYSTEMS
 
-from bayessim_mjx.blind.reality.motion import RUNS, reference
-from bayessim_mjx.blind.reality.system import System
+from bayessim_mjx.blind.reality.system import RUNS, System, reference
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 
 SETTLE = 1.0  # s at rest before a log begins

@@ -27,7 +27,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 from published import PUBLISHED, SOLVED, between_restarts, ppo_config
 
@@ -230,7 +229,6 @@ def main() -> None:
     if args.work:
         work(json.loads(args.work))
     elif args.limit or args.compilation or args.scaling is not None:
-        sys.path.insert(0, str(Path(__file__).parent))
         import limits
 
         limits.measure(args, say)

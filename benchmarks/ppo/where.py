@@ -22,21 +22,18 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
 import mujoco
 import numpy as np
+from limits import bare_own, built, memory, seconds
 from mujoco import mjx
 
 from bayessim_mjx import config, registry
 from bayessim_mjx.rl import losses, networks, policy_of, ppo, transitions
 from bayessim_mjx.rl.catalogue import learner
 from bayessim_mjx.rl.worlds import gather
-
-sys.path.insert(0, str(Path(__file__).parent))
-from limits import bare_own, built, memory, seconds
 
 TASKS = {
     "Ant": 4096, "Humanoid": 4096, "Anymal": 4096, "BallBalance": 4096, "FrankaCabinet": 4096, "ShadowHand": 16384,

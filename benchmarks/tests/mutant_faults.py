@@ -14,7 +14,7 @@ EFFECTS, DISTRIBUTIONS, LOGS = f"{P}/effects", f"{P}/distributions", f"{P}/logs"
 FORCES = "tests/effects/test_actuator_forces.py"
 SENSORS = "tests/effects/test_sensor_effects.py"
 RECORDED = "tests/loop/test_recorded.py"
-ALGEBRA = "tests/test_algebra.py"
+ALGEBRA = "tests/distributions/test_algebra.py"
 MANIFEST = "tests/runs"
 LOG = "tests/logs/test_resample.py"
 SETS = "tests/diagnosis/evidence/test_sets.py"
@@ -77,7 +77,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # distributions
     (
         "the slope of the probit chart has the other sign", f"{DISTRIBUTIONS}/charts.py", "0.5 * z * z + np.float32(",
-        "-0.5 * z * z + np.float32(", ("tests/test_charts.py", "-k", "standard_normal or grid"),
+        "-0.5 * z * z + np.float32(", ("tests/distributions/test_charts.py", "-k", "standard_normal or grid"),
     ),
     (
         "a product forgets how far its factors are apart", f"{DISTRIBUTIONS}/algebra.py",
@@ -103,7 +103,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # rollout
     (
         "a world goes on after its end", EPISODES, "alive & (terminated + truncated == 0), action)", "alive, action)",
-        ("tests/test_rollout.py", "-k", "stands_still"),
+        ("tests/rollout/test_rollout.py", "-k", "stands_still"),
     ),
     (
         "a replay forgets the commands before it", PHYSICS, "memory=filled)", "memory=tuple(memory))",
@@ -112,7 +112,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     (
         "a termination on the last step counts as a truncation too", COLLECTION,
         'truncated = after.info["truncated"] * (1 - terminated)', 'truncated = after.info["truncated"]',
-        ("tests/test_rollout.py", "-k", "termination"),
+        ("tests/rollout/test_rollout.py", "-k", "termination"),
     ),
     # runs
     (
@@ -174,6 +174,6 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # environment
     (
         "a diverged world goes on from where it diverged", TASK, "lambda new, old: jnp.where(sound, new, old)",
-        "lambda new, old: new", ("tests/test_env.py", "-k", "held_in_its_last_sound_state"),
+        "lambda new, old: new", ("tests/env/test_env.py", "-k", "held_in_its_last_sound_state"),
     ),
 )  # fmt: skip

@@ -27,7 +27,7 @@ RESAMPLE = _tests("logs/test_resample")
 SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # agents and wrappers
     (
-        "an agent's observations are divided by the root of their scale", f"{AGENTS}/networks.py",
+        "an agent's observations are divided by the root of their scale", f"{AGENTS}/shared.py",
         "- EPSILON, 0.0) ** 2", "- EPSILON, 0.0)", _tests("wrappers/test_agents", k="by_hand"),
     ),
     (
@@ -47,7 +47,7 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         "rsl_rl: lambda of GAE is its default", f"{AGENTS}/rsl_rl.py", '"lam": ppo.gae_lambda', '"lam": 0.95', SETTINGS,
     ),
     (
-        "mean return and mean length change places", f"{AGENTS}/episodes.py", "returns, lengths = np.mean",
+        "mean return and mean length change places", f"{AGENTS}/shared.py", "returns, lengths = np.mean",
         "lengths, returns = np.mean", _tests("wrappers/test_agents", k="acts_as and sb3"),
     ),
     (

@@ -188,7 +188,7 @@ def measured(name: str, task: str, num_envs: int, repeats: int) -> tuple[float, 
 
 def trained(name: str, task: str) -> float:
     """The return that the lines reach: of the episodes that ended last, or the library's own figure `found`."""
-    from bayessim_mjx.wrappers.agents.episodes import Recent
+    from bayessim_mjx.wrappers.agents.shared import Recent
 
     lines, recent = SNIPPETS[name].strip().splitlines(), None
     with tempfile.TemporaryDirectory() as folder:

@@ -1,32 +1,26 @@
 """The blind suite: baselines on motion whose missing effect is known, noise that lasts, and counts that are refused."""
 
 import json
-import sys
 from pathlib import Path
 
+import bic
+import calibration
+import kinds
 import mujoco
 import numpy as np
 import pytest
+import regression
+import release
+import residual
+import sindy
+import suite
+from systems import SYSTEMS
 
 from bayessim_mjx import atomic
+from bayessim_mjx.blind.plan import KINDS
+from bayessim_mjx.blind.reality.plant import Plant
 
 ROOT = Path(__file__).resolve().parents[2]
-for folder in ("diagnosis", "blind", "blind/entries"):
-    sys.path.insert(0, str(ROOT / "benchmarks" / folder))
-pytest.importorskip("systems")
-import bic  # noqa: E402
-import calibration  # noqa: E402
-import kinds  # noqa: E402
-import regression  # noqa: E402
-import release  # noqa: E402
-import residual  # noqa: E402
-import sindy  # noqa: E402
-import suite  # noqa: E402
-from systems import SYSTEMS  # noqa: E402
-
-from bayessim_mjx.blind.plan import KINDS  # noqa: E402
-from bayessim_mjx.blind.reality.plant import Plant  # noqa: E402
-
 PENDULUM = SYSTEMS["pendulum"]
 
 

@@ -1,22 +1,18 @@
 """The benchmark's baselines against textbook formulas and a linear toy robot."""
 
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 from types import SimpleNamespace
 
+import baselines
+import lda
 import numpy as np
 import pytest
+import worker
+from families import FAMILIES, relatives, without
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
 from bayessim_mjx.diagnosis.selection.models import Model
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
-baselines = pytest.importorskip("baselines")
-import lda  # noqa: E402
-import worker  # noqa: E402
-from families import FAMILIES, relatives, without  # noqa: E402
 
 WINDOWS, SAMPLES, WIDE = 12, 10, 1e6
 RNG = np.random.default_rng(0)

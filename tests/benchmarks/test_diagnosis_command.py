@@ -2,14 +2,10 @@
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
+import blind as command
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
-pytest.importorskip("cases")
-import blind as command  # noqa: E402
 
 WORKER = """import json, sys
 from pathlib import Path

@@ -8,16 +8,14 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+import count_intervals as command
+import counted_cases as counted
+import counted_tables as tables
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
-counted = pytest.importorskip("counted_cases")
-import count_intervals as command  # noqa: E402
-import counted_tables as tables  # noqa: E402
-
-from bayessim_mjx.blind.reality.motion import RUNS  # noqa: E402
-from bayessim_mjx.blind.reality.plant import Plant, Run  # noqa: E402
+from bayessim_mjx.blind.reality.plant import Plant, Run
+from bayessim_mjx.blind.reality.system import RUNS
 
 
 @pytest.fixture(scope="module")

@@ -1,18 +1,14 @@
 """Laws that differ from the library's: what each of them is known to do."""
 
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
+import own_laws as laws
 import pytest
+from systems import SYSTEMS
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
-laws = pytest.importorskip("own_laws")
-from systems import SYSTEMS  # noqa: E402
-
-from bayessim_mjx.blind.reality.menu import CAUSES  # noqa: E402
-from bayessim_mjx.blind.reality.plant import Plant, scales_of  # noqa: E402
+from bayessim_mjx.blind.reality.menu import CAUSES
+from bayessim_mjx.blind.reality.plant import Plant, scales_of
 
 ROBOT = SYSTEMS["pendulum"]
 

@@ -1,21 +1,16 @@
 """Motion by equations that are not MuJoCo's: accelerations, energy, and the motion that MuJoCo's fine steps tend to."""
 
-import sys
-from pathlib import Path
-
 import jax
 import mujoco
 import numpy as np
+import own_motion as motion
+import own_robot
 import pytest
+from own_plant import OwnPlant
+from systems import SYSTEMS
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
-motion = pytest.importorskip("own_motion")
-import own_robot  # noqa: E402
-from own_plant import OwnPlant  # noqa: E402
-from systems import SYSTEMS  # noqa: E402
-
-from bayessim_mjx.blind.reality.menu import CAUSES, places  # noqa: E402
-from bayessim_mjx.blind.reality.plant import Plant, scales_of  # noqa: E402
+from bayessim_mjx.blind.reality.menu import CAUSES, places
+from bayessim_mjx.blind.reality.plant import Plant, scales_of
 
 SIX = [s for s in SYSTEMS if s != "foot"]
 

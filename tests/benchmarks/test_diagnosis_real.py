@@ -1,19 +1,17 @@
 """The real robots' conversions and measures against what was published of them."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import real
+
+from bayessim_mjx.logs import read_logs
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"
-sys.path.insert(0, str(ROOT / "benchmarks" / "diagnosis"))
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="no published logs in ../shared/data")
-real = pytest.importorskip("real")
-
-from bayessim_mjx.logs import read_logs  # noqa: E402
 
 
 @pytest.fixture(scope="module")

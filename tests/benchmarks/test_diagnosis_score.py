@@ -1,18 +1,15 @@
 """Scores, tables and pictures of the blind benchmark on cases written by hand."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
-score = pytest.importorskip("score")
-import systems  # noqa: E402
-import tables  # noqa: E402
-import weights  # noqa: E402
+import score
+import systems
+import tables
+import weights
 
 ELBOW = {"name": "coulomb_friction", "where": "elbow", "parameters": {"level": 0.11}, "raw": 20.0, "left": 9.0}
 HIP = {"name": "actuator_gain", "where": "shoulder_motor", "parameters": {"gain": 1.2}, "raw": 20.0, "left": 9.0}

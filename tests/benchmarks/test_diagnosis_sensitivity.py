@@ -6,11 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import sensitivity
 
 FOLDER = Path(__file__).parents[2] / "benchmarks" / "diagnosis"
-sys.path[:0] = [str(FOLDER), str(FOLDER.parent)]
-
-import sensitivity  # noqa: E402
 
 
 @pytest.mark.parametrize(

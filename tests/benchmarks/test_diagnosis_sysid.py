@@ -1,8 +1,5 @@
 """What mujoco.sysid is given says the same as the library's effects, the benchmark's truth and plain MuJoCo."""
 
-import sys
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
@@ -10,8 +7,6 @@ import pytest
 from bayessim_mjx import effects
 from bayessim_mjx.blind.reality import plant
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"
-sys.path.insert(0, str(BENCHMARKS))
 sysid = pytest.importorskip("mujoco.sysid")
 if not hasattr(sysid, "optimize"):  # the package is there without what it needs
     pytest.skip('mujoco.sysid lacks its dependencies: pip install "mujoco[sysid]"', allow_module_level=True)

@@ -2,24 +2,20 @@
 
 import functools
 import re
-import sys
 from pathlib import Path
 
+import blind
+import cases
+import isolable
 import mujoco
 import numpy as np
 import pytest
 
+from bayessim_mjx.blind.reality import lookalikes, strength
+from bayessim_mjx.blind.reality import plant as truth
 from bayessim_mjx.logs import read_logs
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"
-sys.path.insert(0, str(BENCHMARKS))
-cases = pytest.importorskip("cases")
-import blind  # noqa: E402
-import isolable  # noqa: E402
-
-from bayessim_mjx.blind.reality import lookalikes, strength  # noqa: E402
-from bayessim_mjx.blind.reality import plant as truth  # noqa: E402
-
 PENDULUM = cases.SYSTEMS["pendulum"]
 
 

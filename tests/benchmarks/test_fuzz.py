@@ -4,15 +4,13 @@ import sys
 import warnings
 from pathlib import Path
 
+import fuzz
+import fuzz_cases
+import fuzz_files
+import fuzz_inputs
+import kills
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks" / "tests"))
-import fuzz  # noqa: E402
-import fuzz_cases  # noqa: E402
-import fuzz_files  # noqa: E402
-import fuzz_inputs  # noqa: E402
-import kills  # noqa: E402
 
 
 @pytest.mark.parametrize("kind", fuzz_cases.KINDS)

@@ -1,14 +1,9 @@
 """The classifier two-sample test says of known pairs of distributions what theory says."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from c2st import c2st
 from scipy.stats import norm
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "inference"))
-from c2st import c2st  # noqa: E402
 
 
 # the best classifier of N(0, I) and N(shift e_1, I) is right in Phi(shift / 2) of cases

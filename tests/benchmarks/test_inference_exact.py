@@ -1,18 +1,13 @@
 """Exact posteriors of recorded motion: against the closed form of linear dynamics, and of a valley by counting."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+import refinement
+from exact_posteriors import Recorded, exact
 from scipy.stats import chi2, multivariate_normal
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "inference"))
-import refinement  # noqa: E402
-from exact_posteriors import Recorded, exact  # noqa: E402
-
-from bayessim_mjx.rollout import replay  # noqa: E402
-from bayessim_mjx.tracking import Record  # noqa: E402
+from bayessim_mjx.rollout import replay
+from bayessim_mjx.tracking import Record
 
 pytestmark = pytest.mark.slow
 

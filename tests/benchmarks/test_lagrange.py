@@ -1,14 +1,10 @@
 """The arm that is written down without MuJoCo moves as MuJoCo C's does, and what is hidden in it changes that."""
 
-import sys
-from pathlib import Path
-
+import lagrange
 import mujoco
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
-lagrange = pytest.importorskip("lagrange")
 STEPS = 60
 
 

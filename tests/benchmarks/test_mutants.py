@@ -3,12 +3,9 @@
 import ast
 import dataclasses
 import sys
-from pathlib import Path
 
+import mutants
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "tests"))
-mutants = pytest.importorskip("mutants")
 
 
 def test_there_are_the_thirty_one_of_ppo_and_as_many_others():

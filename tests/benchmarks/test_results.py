@@ -6,12 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import results
 
 ROOT = Path(__file__).resolve().parents[2]
 BENCHMARKS = ROOT / "benchmarks"
-sys.path.insert(0, str(BENCHMARKS))
-import results  # noqa: E402
-
 WORDS = {"results.md": 2000, "history.md": 1500, "how-to-run.md": 1200}
 SECTION = 120  # words of a section's text
 CITING = ("*.py", "*.md", "*.yaml", "*.yml")  # files that may cite a record

@@ -7,10 +7,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from recorded import pendulum
 
 from bayessim_mjx import blind_check
 from bayessim_mjx.blind import show, worker
+from tests.blind.recorded import pendulum
 
 ENTRY = Path(__file__).with_name("entry.py")
 

@@ -5,7 +5,6 @@ import dataclasses
 import mujoco
 import numpy as np
 import pytest
-from recorded import PENDULUM, pendulum
 
 from bayessim_mjx.blind.reality import twin
 from bayessim_mjx.blind.reality.menu import CAUSES, KNOWN, places
@@ -13,6 +12,7 @@ from bayessim_mjx.blind.reality.plant import FINER, Plant, base_names, scale_bas
 from bayessim_mjx.blind.reality.strength import Ruler
 from bayessim_mjx.blind.robot import load_model, rig_of_logs, rig_of_menu
 from bayessim_mjx.errors import UserError
+from tests.blind.recorded import PENDULUM, pendulum
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from arms import FALL, MOTOR, SERVO, arm, hidden, sole
 
 from bayessim_mjx import effects
 from bayessim_mjx.blind.check import Check, effects_of, unasked
 from bayessim_mjx.blind.reality import twin
 from bayessim_mjx.blind.reality.drives import quickest
-from bayessim_mjx.blind.reality.ground import ground
+from bayessim_mjx.blind.reality.links import ground
 from bayessim_mjx.blind.reality.menu import CAUSES, KNOWN
 from bayessim_mjx.blind.reality.plant import Plant, scales_of
 from bayessim_mjx.blind.reality.strength import Ruler, resize
@@ -24,6 +23,7 @@ from bayessim_mjx.effects import make
 from bayessim_mjx.effects.ground_height import ground as ground_of_the_library
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics, control_step
+from tests.blind.arms import FALL, MOTOR, SERVO, arm, hidden, sole
 
 PLACES = {
     "lugre_friction": "hinge", "cable_tension": "hinge", "gravity_compensation": "world", "inertial_parameters": "link",

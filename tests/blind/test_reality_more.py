@@ -3,13 +3,13 @@
 import mujoco
 import numpy as np
 import pytest
-from arms import ARM, FALL, GRAVITY, LENGTH, MASS, MOTOR, SERVO, arm, hidden, sole
 
 from bayessim_mjx.blind.reality.drives import quickest
-from bayessim_mjx.blind.reality.ground import ground, lift
+from bayessim_mjx.blind.reality.links import ground, lift
 from bayessim_mjx.blind.reality.menu import places
 from bayessim_mjx.blind.reality.plant import Plant
 from bayessim_mjx.blind.reality.system import System
+from tests.blind.arms import ARM, FALL, GRAVITY, LENGTH, MASS, MOTOR, SERVO, arm, hidden, sole
 
 
 def still(plant: Plant, q: float, u: float = 0.0) -> float:

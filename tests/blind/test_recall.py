@@ -1,8 +1,6 @@
 """A diagnosis is told what a blind check of the same logs would have missed."""
 
 import json
-import sys
-from pathlib import Path
 
 import pytest
 
@@ -10,9 +8,7 @@ from bayessim_mjx.blind import findings
 from bayessim_mjx.blind.recall import beside, recall
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.report.page import render
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "report"))
-import fake  # noqa: E402
+from tests.report import fake
 
 SAID = "backlash at elbow: half of the play under 3 mrad may be missed"
 

@@ -1,13 +1,10 @@
 """What tests of commands share: no cache, a folder of their own, every task the toy where they ask for it."""
 
-import sys
 from pathlib import Path
 
 import pytest
 
 from bayessim_mjx import registry
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture(autouse=True)
@@ -20,6 +17,6 @@ def quiet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every task is the toy."""
-    from toy_runs import TOY
+    from tests.commands.toy_runs import TOY
 
     monkeypatch.setattr(registry, "make", lambda name, **_: TOY)

@@ -3,10 +3,10 @@
 from typing import Any
 
 import pytest
-from toy_runs import error_of
 
 from bayessim_mjx import cli, main, play, train
 from bayessim_mjx.errors import UserError
+from tests.commands.toy_runs import error_of
 
 THEIRS = (
     "--episode_length --sim_device --rl_device --pipeline --graphics_device_id --flex --physx --num_threads --subscenes"

@@ -5,9 +5,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from toy_runs import error_of
 
 from bayessim_mjx import cli, main
+from tests.commands.toy_runs import error_of
 
 pytest.importorskip("shtab")
 

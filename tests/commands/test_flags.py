@@ -14,12 +14,12 @@ from typing import Any
 import jax
 import mujoco
 import pytest
-from toy_runs import SMALL, error_of
 
 import bayessim_mjx
 from bayessim_mjx import cli, diagnose, main, play, train
 from bayessim_mjx.cli.commands import module_of
 from bayessim_mjx.errors import UserError
+from tests.commands.toy_runs import SMALL, error_of
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from toy_runs import TOY, error_of
 
 from bayessim_mjx import implementations, main, registry
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics import implementation, measured
 from bayessim_mjx.rl import speed
 from bayessim_mjx.rl.speed import Speed
+from tests.commands.toy_runs import TOY, error_of
 
 INSTALLED = implementation.installed()
 CARTPOLE = ("--task", "cartpole", "--headless")

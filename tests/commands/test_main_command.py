@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from toy_runs import LOOP, SMALL, Killed, checkpoint_of, killed_after, repeated_events
 
 from bayessim_mjx import cli, config, main, play, registry
 from bayessim_mjx.runs import Run, latest_run
+from tests.commands.toy_runs import LOOP, SMALL, Killed, checkpoint_of, killed_after, repeated_events
 
 
 def test_main_stops_only_after_the_rounds_checkpoint() -> None:

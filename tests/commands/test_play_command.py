@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy_runs import SMALL, TOY, Toy, error_of
 
 from bayessim_mjx import config, play, registry, train
 from bayessim_mjx.cli import policies
@@ -16,6 +15,7 @@ from bayessim_mjx.env import State
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.runs import checkpoints, latest_run
+from tests.commands.toy_runs import SMALL, TOY, Toy, error_of
 
 
 @pytest.mark.parametrize("flag", ["--max_iterations=3", "--video_interval", "--name", "--resume"])

@@ -4,11 +4,11 @@ import re
 from pathlib import Path
 
 import pytest
-from toy_runs import SMALL, error_of
 
 from bayessim_mjx import cli, play, train
 from bayessim_mjx.rl import pretrained
 from bayessim_mjx.runs import latest_run
+from tests.commands.toy_runs import SMALL, error_of
 
 
 @pytest.mark.slow

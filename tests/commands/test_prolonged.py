@@ -4,10 +4,10 @@ import json
 from typing import Any
 
 import pytest
-from toy_runs import SMALL, Killed, checkpoint_of, error_of, killed_after, repeated_events
 
 from bayessim_mjx import config, main, train
 from bayessim_mjx.runs import Run, latest_run
+from tests.commands.toy_runs import SMALL, Killed, checkpoint_of, error_of, killed_after, repeated_events
 
 # a learning rate that falls at every second step, networks for novelty, a ramp of their weight over 20 control steps;
 # logs and checkpoints every third iteration, so that 4 is the end of neither

@@ -6,11 +6,11 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from toy_runs import LOOP, SMALL, TOY
 
 from bayessim_mjx import cli, loop, progress, rl
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.loop import watching
+from tests.commands.toy_runs import LOOP, SMALL, TOY
 
 
 def settings() -> Any:

@@ -8,11 +8,11 @@ from typing import Any
 
 import jax
 import pytest
-from toy_runs import SMALL, Killed, checkpoint_of, error_of, killed_after, repeated_events
 
 from bayessim_mjx import train
 from bayessim_mjx.errors import DivergedError, UserError
 from bayessim_mjx.runs import Run, checkpoints, latest_run
+from tests.commands.toy_runs import SMALL, Killed, checkpoint_of, error_of, killed_after, repeated_events
 
 
 def test_what_the_allocator_refuses_names_the_numbers_to_lower(toy: None, monkeypatch: Any, capsys: Any) -> None:

@@ -6,13 +6,13 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from toy_runs import LOOP, SMALL, TOY, error_of
 
 from bayessim_mjx import main, play, train
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.loop.posterior import restored
 from bayessim_mjx.runs import Run, latest_run
 from bayessim_mjx.wrappers.worlds import domain_of
+from tests.commands.toy_runs import LOOP, SMALL, TOY, error_of
 
 ARGV = ["--task", "Pendulum", *SMALL]
 
@@ -71,7 +71,7 @@ def test_a_runs_posterior_is_a_domain_and_its_settings_hold(evaluated: list) -> 
 
 
 def test_a_resumed_run_keeps_its_domain(evaluated: list, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from toy_runs import Killed, killed_after
+    from tests.commands.toy_runs import Killed, killed_after
 
     Distribution.gaussian(TOY.space, [0.6], [0.001]).save(tmp_path / "light.npz")
     with monkeypatch.context() as patch, pytest.raises(Killed):

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from toy_runs import error_of
 
 from bayessim_mjx import cli, main
 from bayessim_mjx.errors import UserError
+from tests.commands.toy_runs import error_of
 
 ARM = """<mujoco><worldbody><body name="link"><joint name="hinge"/><geom size=".1"/></body></worldbody>
 <actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""

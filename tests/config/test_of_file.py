@@ -3,7 +3,7 @@
 import pytest
 
 from bayessim_mjx import registry
-from bayessim_mjx.config.of_file import OfFile
+from bayessim_mjx.config.loading import OfFile
 from bayessim_mjx.tasks.pendulum import Pendulum
 
 

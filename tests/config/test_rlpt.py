@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from bayessim_mjx.config import Config, PPOConfig, load, rlpt
+from bayessim_mjx.config import Config, PPOConfig, foreign, load
 from bayessim_mjx.errors import UserError
 
 FILE = """
@@ -91,5 +91,5 @@ def test_nonsense_is_refused_by_name(text: str, words: str, tmp_path: Path) -> N
 
 def test_what_it_is_taken_over_to_is_there() -> None:
     ours = {f.name for f in dataclasses.fields(PPOConfig)}
-    names = [name for keys in rlpt.OURS.values() for name in keys.values()]
+    names = [name for keys in foreign.RLPT.values() for name in keys.values()]
     assert {name.removeprefix("ppo.") for name in names if name != "seed"} <= ours and len(set(names)) == len(names)

@@ -1,15 +1,10 @@
 """Friction of another size in every joint, hidden in MuJoCo C: named at each of them, with its value."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+import rigs
 
 import bayessim_mjx
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks" / "diagnosis"))
-rigs = pytest.importorskip("rigs")
 
 OFFERED = ["coulomb_friction", "viscous_friction", "stribeck_friction", "actuator_gain"]
 

@@ -1,17 +1,12 @@
 """Payload, inertials, tilted gravity, forces from outside and a rocking base, against MuJoCo C with the same in it."""
 
-import sys
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from truths import edited, moved, physics, recovered, truth  # noqa: E402
-
 from bayessim_mjx.effects import make
 from bayessim_mjx.errors import UserError
+from tests.effects.truths import edited, moved, physics, recovered, truth
 
 ARM = """
 <mujoco>

@@ -1,16 +1,11 @@
 """Cables that are slack up to an angle: by hand, against tendons of MuJoCo C, and against a spring."""
 
-import sys
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from truths import edited, moved, physics, recovered, truth  # noqa: E402
-
 from bayessim_mjx.effects import make
+from tests.effects.truths import edited, moved, physics, recovered, truth
 
 XML = """
 <mujoco>

@@ -1,17 +1,12 @@
 """Friction and softness of contacts: balls that slide and fall on a floor, against MuJoCo C and by hand."""
 
-import sys
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from truths import edited, moved, physics, recovered, truth  # noqa: E402
-
-from bayessim_mjx.effects import make  # noqa: E402
-from bayessim_mjx.errors import UserError  # noqa: E402
+from bayessim_mjx.effects import make
+from bayessim_mjx.errors import UserError
+from tests.effects.truths import edited, moved, physics, recovered, truth
 
 BALL = """
     <body name="{0}" pos="0 {1} .1">

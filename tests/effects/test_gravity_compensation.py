@@ -1,16 +1,11 @@
 """Weight that the drives carry unasked, against MuJoCo C's gravcomp."""
 
-import sys
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from truths import edited, moved, physics, truth  # noqa: E402
-
 from bayessim_mjx.effects import make
+from tests.effects.truths import edited, moved, physics, truth
 
 LINK = '<geom type="box" pos=".15 .02 .05" euler="20 30 10" size=".15 .03 .05" mass="{}" contype="0" conaffinity="0"/>'
 XML = f"""

@@ -1,20 +1,15 @@
 """Ground that is higher or lower: against MuJoCo C with a plane that is moved, and by hand."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from truths import edited, moved, physics, recovered, truth  # noqa: E402
-
 from bayessim_mjx.effects import make
 from bayessim_mjx.effects.ground_height import ground
 from bayessim_mjx.errors import UserError
+from tests.effects.truths import edited, moved, physics, recovered, truth
 
 # two feet, over a floor and over a step in a turned frame; a base with a shell of its own that carries the legs
 XML = """

@@ -1,21 +1,15 @@
 """Bristles against their differential equation in float64, by hand, and against friction without presliding."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-sys.path.insert(0, str(Path(__file__).parent))
-from truths import CONTROL, moved, physics, recovered  # noqa: E402
-
-from bayessim_mjx.effects import make
-from bayessim_mjx.effects.support import bristles
+from bayessim_mjx.effects import lugre_friction, make
 from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.errors import UserError
+from tests.effects.truths import CONTROL, moved, physics, recovered
 
 MASS = 2.0
 LIFT = """
@@ -177,7 +171,9 @@ def test_a_recorded_past_bends_the_bristles():
     assert float(memory["force"][0]) == pytest.approx(-(1 - np.exp(-0.8)), rel=1e-4)
     assert float(memory["unknown"][0]) == pytest.approx(np.exp(-0.8), rel=1e-4)
     np.testing.assert_array_equal(same.qpos, qpos)
-    there = bristles.wound(memory, jnp.array([[0.005]]), jnp.full((1, 1), 3.0), jnp.array([3.0]), jnp.array([0.01]))
+    there = lugre_friction.wound(
+        memory, jnp.array([[0.005]]), jnp.full((1, 1), 3.0), jnp.array([3.0]), jnp.array([0.01])
+    )
     want = 1 - np.exp(-0.5) * (1 - float(memory["force"][0]))
     assert float(there["force"][0]) == pytest.approx(want, rel=1e-4)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.effects import make
-from bayessim_mjx.effects.support.profile import trapezoid
+from bayessim_mjx.effects.acceleration_limit import trapezoid
 
 MODEL = mujoco.MjModel.from_xml_string(
     '<mujoco><worldbody><body><joint name="x"/><geom size=".1"/></body></worldbody>'

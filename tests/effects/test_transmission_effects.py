@@ -1,19 +1,15 @@
 """Elasticity and backlash against MuJoCo C with the motor as a body of its own, at a tenth of the timestep."""
 
 import functools
-import sys
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from truths import moved, physics, recovered, truth  # noqa: E402
-
-from bayessim_mjx.effects import make  # noqa: E402
-from bayessim_mjx.parameters import Parameter, ParameterSpace  # noqa: E402
-from bayessim_mjx.physics import Physics  # noqa: E402
+from bayessim_mjx.effects import make
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.physics import Physics
+from tests.effects.truths import moved, physics, recovered, truth
 
 LINK = """
       <joint name="{0}" axis="0 1 0" damping="{2}" armature="{1}"/>

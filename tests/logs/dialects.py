@@ -8,7 +8,8 @@ from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
-from log_files import HEADER, rows
+
+from tests.logs.log_files import HEADER, rows
 
 SERVO = """
 <mujoco><compiler angle="radian" autolimits="true"/><option timestep="0.005"/>

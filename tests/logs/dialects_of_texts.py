@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from dialects import NAMES, PLAIN, TRUTH, Case, changed, comma, text
+
+from tests.logs.dialects import NAMES, PLAIN, TRUTH, Case, changed, comma, text
 
 READR = "tidyverse/readr#749: decimal commas and semicolons of European spreadsheets"
 SEMICOLONS = "asafdav/ng-csv#28: European Excel wants semicolons; sep= lines"

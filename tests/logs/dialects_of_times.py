@@ -5,7 +5,8 @@ from __future__ import annotations
 from datetime import datetime
 
 import numpy as np
-from dialects import HEADER, NAMES, TRUTH, Case, changed, dated, stamped, text, with_column
+
+from tests.logs.dialects import HEADER, NAMES, TRUTH, Case, changed, dated, stamped, text, with_column
 
 BAGPY = "jmscslgroup/bagpy#15: stamps are 1.6e9 in one export and 1.6e18 in another"
 SECS = "jmscslgroup/bagpy#21: stamps are secs and nsecs in two columns"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from dialects import HEADER, SERVO_HEADER, TRUTH, Case, servo_truth, text, with_column
+
+from tests.logs.dialects import HEADER, SERVO_HEADER, TRUTH, Case, servo_truth, text, with_column
 
 DEGREES = "huggingface/lerobot#1259: joints in degrees or percent, the gripper always 0 to 100"
 PERCENT = "huggingface/lerobot#607: a gripper in percent of its range"

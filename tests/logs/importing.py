@@ -7,10 +7,10 @@ from typing import Any
 
 import mujoco
 import pytest
-from log_files import ARM
 
 from bayessim_mjx import import_logs
 from bayessim_mjx.logs import Log, read_logs
+from tests.logs.log_files import ARM
 
 START = 1_700_000_000_000_000_000  # ns
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from log_files import GOOD_MAP, HEADER, refused, rows, write
 
 from bayessim_mjx.logs import read_logs, resample
+from tests.logs.log_files import GOOD_MAP, HEADER, refused, rows, write
 
 SIGNED = {"sign_magnitude": 10, "scale": 0.001}
 

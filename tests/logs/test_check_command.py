@@ -5,12 +5,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from importing import error, model_of
-from log_files import ARM, HEADER, rows, write
 
 from bayessim_mjx import import_logs
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.proposal import parts, propose
+from tests.logs.importing import error, model_of
+from tests.logs.log_files import ARM, HEADER, rows, write
 
 MODEL = mujoco.MjModel.from_xml_string(ARM)
 

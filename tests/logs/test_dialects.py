@@ -8,14 +8,14 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from dialects import SERVO, TRUTH, Case, text
-from dialects_of_texts import CASES as TEXTS
-from dialects_of_times import CASES as TIMES
-from dialects_of_units import CASES as UNITS
-from log_files import ARM, HEADER
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Log, LogMap, read_logs
+from tests.logs.dialects import SERVO, TRUTH, Case, text
+from tests.logs.dialects_of_texts import CASES as TEXTS
+from tests.logs.dialects_of_times import CASES as TIMES
+from tests.logs.dialects_of_units import CASES as UNITS
+from tests.logs.log_files import ARM, HEADER
 
 CASES = {case.name: case for case in (*TEXTS, *TIMES, *UNITS)}
 OWN = {"ctrl": ("m_shoulder", "m_elbow"), "qpos": ("shoulder", "elbow")}

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from importing import START, call, error, model_of, named, read, stamp
 
 from bayessim_mjx import import_logs
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.importers.ros import Choice, Message, recording
 from bayessim_mjx.logs.importers.streams import Recording, Stream
+from tests.logs.importing import START, call, error, model_of, named, read, stamp
 
 
 def bodies(topics: dict[str, Callable[[int], Any]], kinds: dict[str, str], count: int = 20) -> list[Message]:

@@ -8,10 +8,10 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from importing import START, call, error, model_of, read
-from log_files import ARM
 
 from bayessim_mjx.logs import Log, read_logs
+from tests.logs.importing import START, call, error, model_of, read
+from tests.logs.log_files import ARM
 
 JOINTS = ("shoulder", "elbow")
 STATES, SENT, FELT = "/joint_states", "/effort_controller/commands", "/imu/data"

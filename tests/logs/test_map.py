@@ -5,11 +5,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from log_files import FREE, GOOD_MAP, refused, rows, write
 
 from bayessim_mjx.logs import Channels, Log, read_logs, resample, segments
 from bayessim_mjx.logs.csv_files import read_csv
 from bayessim_mjx.logs.mapping import Source
+from tests.logs.log_files import FREE, GOOD_MAP, refused, rows, write
 
 WHOLE = {"ctrl": {"m_shoulder": 1, "m_elbow": 2}, "qpos": {"shoulder": 3, "elbow": 4}}
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from log_files import HEADER, refused, rows, write
 
 from bayessim_mjx.logs import read_logs, segments, write_log
+from tests.logs.log_files import HEADER, refused, rows, write
 
 
 def test_csv_and_npz_hold_the_same_log(tmp_path: Path, arm: mujoco.MjModel) -> None:

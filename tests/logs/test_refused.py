@@ -5,10 +5,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from log_files import GOOD_MAP, HEADER, refused, rows, write
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import read_logs
+from tests.logs.log_files import GOOD_MAP, HEADER, refused, rows, write
 
 
 def broken(kind: str) -> tuple[np.ndarray, str]:

@@ -5,11 +5,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from log_files import HEADER, rows, write
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Channels, estimate_velocity, noise, read_logs, resample, segments
 from bayessim_mjx.logs.signals import noise_level, quantum
+from tests.logs.log_files import HEADER, rows, write
 
 
 def test_irregular_log_is_resampled(tmp_path: Path, arm: mujoco.MjModel) -> None:

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from importing import START, named, stamp
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.importers.ros import Choice, Message, recording
+from tests.logs.importing import START, named, stamp
 
 STEP = 10_000_000  # ns
 

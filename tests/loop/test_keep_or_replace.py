@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stub_source import SPACE, infer, made
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.loop import examination, round_inference
 from bayessim_mjx.loop.state import Answer, Evidence
+from tests.loop.stub_source import SPACE, infer, made
 
 
 @dataclasses.dataclass

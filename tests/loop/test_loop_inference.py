@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stub_source import FITTED, NOISE, NORMAL, SPACE, infer, made
 
 from bayessim_mjx.loop import examination
+from tests.loop.stub_source import FITTED, NOISE, NORMAL, SPACE, infer, made
 
 
 def assert_same_structure(a, b):

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stub_source import FITTED, NOISE, SPACE, infer, made
 
 from bayessim_mjx import registry
 from bayessim_mjx.distributions import Distribution
@@ -15,6 +14,7 @@ from bayessim_mjx.inference.range_ends import Pile
 from bayessim_mjx.loop.sources import limits_of
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.parameters.ranged import Ranged
+from tests.loop.stub_source import FITTED, NOISE, SPACE, infer, made
 
 MOVING = ["bayessim.range_ends=move", "bayessim.realIters=4", "bayessim.ensemble=1"]
 

@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from stub_source import NOISE, infer, made
 
 from bayessim_mjx.loop import set_posterior
 from bayessim_mjx.loop.state import Answer, Evidence, Round
+from tests.loop.stub_source import NOISE, infer, made
 
 
 @pytest.mark.slow

@@ -174,7 +174,7 @@ def test_warnings_for_the_user_are_lines_and_others_keep_their_way():
 
 
 def test_compile_time_of_a_program_inside_another_counts_once():
-    from bayessim_mjx.monitor.compile_clock import BACKEND, COMPILE, RETRIEVED, CompileClock
+    from bayessim_mjx.monitor.clock import BACKEND, COMPILE, RETRIEVED, CompileClock
 
     now = [0.0]
     clock = CompileClock(lambda: now[0])

@@ -252,9 +252,8 @@ def report_of(d, pairs=300):
 
 @pytest.mark.parametrize("d", [2, 13])
 def test_all_that_a_calibration_picture_says_is_inside_of_it(d):
-    from bayessim_mjx.monitor import trust
 
-    figure = trust.calibration(report_of(d), round=2)
+    figure = plots.calibration(report_of(d), round=2)
     assert overlaps(figure) == [] and outside(figure) == []
     words = texts(figure)
     [(_, table)] = [(text, box) for text, box in words if "95 %:  93 ± 1 %" in text]
@@ -265,11 +264,10 @@ def test_all_that_a_calibration_picture_says_is_inside_of_it(d):
 
 def test_a_calibration_picture_shows_posteriors_of_several_trajectories():
     from bayessim_mjx.inference.product_calibration import Count, Sets
-    from bayessim_mjx.monitor import trust
 
     even = (np.arange(64) + 0.5) / 64
     sets = Sets(tuple(Count(n, 1.2, 2.0 + n, 0.1, 2.0, even) for n in (1, 2, 4, 8, 11)))
-    figure = trust.calibration(report_of(2), round=2, sets=sets)
+    figure = plots.calibration(report_of(2), round=2, sets=sets)
     assert overlaps(figure) == [] and outside(figure) == []
     words = [text for text, _ in texts(figure)]
     assert any("carries all 11 trajectories" in " ".join(text.split()) for text in words) and "13.0" in words

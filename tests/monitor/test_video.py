@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.monitor import lettering, rendering, video
+from bayessim_mjx.monitor import rendering, video
 from bayessim_mjx.monitor.camera import reach, view_of
 
 PENDULUM = """<mujoco><worldbody><body name="pole"><joint type="hinge" axis="0 1 0"/>
@@ -162,19 +162,19 @@ def letters(part):
 
 def test_title_and_captions_stand_on_a_strip_below_the_picture():
     blank = np.full((3, 240, 320, 3), 200, np.uint8)
-    frames = lettering.underline(blank, 16, "Pendulum, round 2", ["0.00 s    return 0", "0.10 s    return -3", ""])
+    frames = video.underline(blank, 16, "Pendulum, round 2", ["0.00 s    return 0", "0.10 s    return -3", ""])
     assert frames.shape == (3, 256, 320, 3) and (frames[:, :240] == 200).all()  # nothing of the picture is hidden
     title, caption = frames[:, 240:, :160], frames[:, 240:, 160:]
     assert all(letters(t) > 40 for t in title) and (title[0] == title[1]).all()
     assert letters(caption[0]) > 40 and (caption[0] != caption[1]).any() and letters(caption[2]) == 0
-    long = lettering.underline(blank, 16, 20 * "long ", ["9.99 s    return -1234.5    terminated"] * 3)
+    long = video.underline(blank, 16, 20 * "long ", ["9.99 s    return -1234.5    terminated"] * 3)
     assert letters(long[0, 240:, :4]) == 0 == letters(long[0, 240:, -4:])  # smaller letters, both ends free
 
 
 def test_captions_follow_the_rows_that_are_picked(monkeypatch):
     drawn = {}
     monkeypatch.setattr(video, "render", lambda m, worlds, w, h, *_: [np.zeros((len(worlds[0]), h, w, 3), np.uint8)])
-    monkeypatch.setattr(video.lettering, "underline", lambda frames, *rest: drawn.setdefault("rest", rest) and frames)
+    monkeypatch.setattr(video, "underline", lambda frames, *rest: drawn.setdefault("rest", rest) and frames)
     video.record(model(PENDULUM), np.zeros((5, 1)), fps=5, dt=0.1, title="P", captions=list("abcde"))
     assert drawn["rest"] == (15, "P", ["a", "c"])  # half a second at 5 frames a second: seconds 0 and 0.2
     with pytest.raises(ValueError, match="2 captions for 1 world"):

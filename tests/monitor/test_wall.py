@@ -1,7 +1,7 @@
 """Rewards over seconds: one point per second, and a resumed run goes on where its checkpoint was."""
 
-from bayessim_mjx.monitor.wall import Wall, marked
 from bayessim_mjx.monitor.writer import event_files, records
+from bayessim_mjx.monitor.writers import Wall, marked
 
 METRICS = {"Train/mean_reward": 1.0, "Train/mean_episode_length": 5.0, "Loss/kl": 0.1}
 

@@ -2,10 +2,18 @@
 
 import mujoco
 import pytest
-from parameter_models import CARTPOLE, CARTPOLE_SECTION, PENDULUM, PENDULUM_SECTION, WALKER, additive, scaling
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
+from tests.parameters.parameter_models import (
+    CARTPOLE,
+    CARTPOLE_SECTION,
+    PENDULUM,
+    PENDULUM_SECTION,
+    WALKER,
+    additive,
+    scaling,
+)
 
 
 def read(xml, section):

@@ -5,12 +5,20 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from parameter_models import CARTPOLE, CARTPOLE_SECTION, PENDULUM, PENDULUM_SECTION, WALKER, additive, scaling
-from recompile import assert_write_equals_recompile, random_thetas, spec_of
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace, set_const
 from bayessim_mjx.parameters.constants import mjx
+from tests.parameters.parameter_models import (
+    CARTPOLE,
+    CARTPOLE_SECTION,
+    PENDULUM,
+    PENDULUM_SECTION,
+    WALKER,
+    additive,
+    scaling,
+)
+from tests.parameters.recompile import assert_write_equals_recompile, random_thetas, spec_of
 
 NUMBERS = {
     "rigid_body_properties": {

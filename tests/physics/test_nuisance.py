@@ -14,7 +14,7 @@ from bayessim_mjx.config import PPOConfig, from_dict
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
-from bayessim_mjx.parameters.schedule import OVER, Schedule
+from bayessim_mjx.parameters.parameter import OVER, Schedule
 from bayessim_mjx.physics import nuisance
 from bayessim_mjx.rl import worlds
 from bayessim_mjx.rl.recurrent import remembering

@@ -1,17 +1,13 @@
 """Named effects stand beside black boxes on the page, in one sentence, and nowhere where they were not tried."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-import fake  # noqa: E402
 
 from bayessim_mjx.diagnosis.phrases import residual
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes, Term
 from bayessim_mjx.report import evidence
+from tests.report import fake
 
 TERMS = (Term("elbow", "sign w", -0.0613), Term("elbow", "1", 0.2), Term("wrist", "u of elbow", 0.5))
 

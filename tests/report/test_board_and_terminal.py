@@ -2,18 +2,14 @@
 
 import dataclasses
 import io
-import sys
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-import fake  # noqa: E402
-
-from bayessim_mjx import report  # noqa: E402
-from bayessim_mjx.diagnosis.phrases.advice import VERDICTS as WORDS  # noqa: E402
-from bayessim_mjx.diagnosis.result import VERDICTS  # noqa: E402
-from bayessim_mjx.monitor.writer import event_files, records  # noqa: E402
+from bayessim_mjx import report
+from bayessim_mjx.diagnosis.phrases.advice import VERDICTS as WORDS
+from bayessim_mjx.diagnosis.result import VERDICTS
+from bayessim_mjx.monitor.writer import event_files, records
+from tests.report import fake
 
 
 def _written(folder):

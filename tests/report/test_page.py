@@ -2,18 +2,14 @@
 
 import dataclasses
 import json
-import sys
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-import fake  # noqa: E402
-
-from bayessim_mjx import report  # noqa: E402
-from bayessim_mjx.diagnosis.phrases.advice import verdict_of  # noqa: E402
-from bayessim_mjx.diagnosis.result import VERDICTS, load  # noqa: E402
+from bayessim_mjx import report
+from bayessim_mjx.diagnosis.phrases.advice import verdict_of
+from bayessim_mjx.diagnosis.result import VERDICTS, load
+from tests.report import fake
 
 VOID = {
     "meta",

@@ -6,13 +6,13 @@ import os
 import sys
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
+sys.path.insert(0, str(Path(__file__).parents[2]))  # a program, which pytest does not start
 
 
 @functools.cache
 def walk():
     """One environment, so that a second training of a kind compiles nothing."""
-    import probes
+    from tests.rl import probes
 
     env = probes.Walk()
     env.dt = 1.0

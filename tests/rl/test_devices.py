@@ -9,7 +9,6 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import probes
 import pytest
 
 from bayessim_mjx import device, rl
@@ -17,6 +16,7 @@ from bayessim_mjx.config import Config, PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import ppo
 from bayessim_mjx.rollout import ring
+from tests.rl import probes
 
 SCRIPT = Path(__file__).with_name("sharded.py")
 CONFIG = PPOConfig(num_envs=64, num_steps=4, num_epochs=1, num_minibatches=2, hidden_actor=(4,), hidden_critic=(4,))

@@ -5,11 +5,11 @@ import importlib
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 
 from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig
+from tests.rl import probes
 
 # the package has a function of this name
 evaluation = importlib.import_module("bayessim_mjx.rl.evaluate")

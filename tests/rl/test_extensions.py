@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 
 from bayessim_mjx import rl
@@ -16,6 +15,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import catalogue, losses, networks
 from bayessim_mjx.rl.extension import Extension, Learner
 from bayessim_mjx.rl.train import _make_chunk, tags
+from tests.rl import probes
 
 CONFIG = PPOConfig(
     num_envs=16, num_steps=8, num_epochs=1, num_minibatches=1, hidden_actor=(4,), hidden_critic=(4,), log_interval=2

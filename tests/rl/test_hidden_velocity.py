@@ -4,12 +4,12 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import probes
 import pytest
 
 from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.rl import recurrent
+from tests.rl import probes
 
 DT = 0.4  # s, of a period of 2 pi
 

@@ -5,7 +5,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 
 from bayessim_mjx import rl
@@ -13,6 +12,7 @@ from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.rl import networks, normalise, privileged
+from tests.rl import probes
 
 CONFIG = PPOConfig(
     num_envs=64, num_steps=8, num_epochs=4, num_minibatches=4, learning_rate=3e-3, schedule="fixed", gamma=0.9,

@@ -5,7 +5,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 
 from bayessim_mjx import rl
@@ -14,6 +13,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import normalise, ppo, rnd, worlds
 from bayessim_mjx.rl.catalogue import learner
 from bayessim_mjx.rl.train import tags
+from tests.rl import probes
 
 RND = RNDConfig(num_outputs=2, weight=1.0)
 CONFIG = PPOConfig(

@@ -91,7 +91,7 @@ def test_the_values_to_learn_from_are_the_critics_and_keep_their_gradient():
 
 
 def test_one_segment_of_all_steps_is_the_estimate_of_the_whole_batch():
-    import probes
+    from tests.rl import probes
 
     config = dataclasses.replace(CONFIG, segment=6, hidden_critic=(8,), gamma=0.9)
     env = probes.Walk()

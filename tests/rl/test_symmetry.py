@@ -7,7 +7,6 @@ import types
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 
 from bayessim_mjx import rl
@@ -18,6 +17,7 @@ from bayessim_mjx.rl import losses, networks, normalise, symmetry
 from bayessim_mjx.rl.catalogue import active, learner
 from bayessim_mjx.rl.extension import Learner
 from bayessim_mjx.rl.train import tags
+from tests.rl import probes
 
 CONFIG = PPOConfig(
     num_envs=16, num_steps=8, num_epochs=2, num_minibatches=2, schedule="fixed", hidden_actor=(8,), hidden_critic=(8,)

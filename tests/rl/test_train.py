@@ -6,7 +6,6 @@ import importlib
 import jax
 import jax.numpy as jnp
 import numpy as np
-import probes
 import pytest
 
 from bayessim_mjx import memory, rl
@@ -15,6 +14,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import networks, normalise, ppo, transitions, worlds
 from bayessim_mjx.rl.catalogue import learner
 from bayessim_mjx.rl.train import time as clock
+from tests.rl import probes
 
 # the package has a function of this name
 training = importlib.import_module("bayessim_mjx.rl.train")

@@ -1,14 +1,11 @@
 """What tests of runs share."""
 
-import sys
 from pathlib import Path
 
 import pytest
 
 from bayessim_mjx import config
 from bayessim_mjx.runs import Run
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture

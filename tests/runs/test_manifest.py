@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_runs import same_bits, tree
 
 from bayessim_mjx import runs
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.runs import Run
+from tests.runs.small_runs import same_bits, tree
 
 
 @pytest.mark.parametrize(

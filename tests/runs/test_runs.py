@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_runs import Moments, same_bits, tree
 
 from bayessim_mjx import config, runs
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.runs import Run, checkpoints
+from tests.runs.small_runs import Moments, same_bits, tree
 
 
 def test_folder_holds_settings_command_and_versions(run: Run) -> None:

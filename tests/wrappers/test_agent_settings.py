@@ -5,24 +5,20 @@ A setting that is added to `PPOConfig`, or to a section in it, fails here until 
 
 import dataclasses
 import math
-import sys
 import typing
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-import read_back  # noqa: E402
-from toys import Mirrored, Plain  # noqa: E402
-
-from bayessim_mjx import config  # noqa: E402
-from bayessim_mjx.config import PPOConfig, RNDConfig, SymmetryConfig  # noqa: E402
-from bayessim_mjx.config.settings import WeightSchedule  # noqa: E402
-from bayessim_mjx.errors import UserError  # noqa: E402
-from bayessim_mjx.rl import losses, rnd  # noqa: E402
-from bayessim_mjx.wrappers import agents  # noqa: E402
+from bayessim_mjx import config
+from bayessim_mjx.config import PPOConfig, RNDConfig, SymmetryConfig
+from bayessim_mjx.config.settings import WeightSchedule
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.rl import losses, rnd
+from bayessim_mjx.wrappers import agents
+from tests.wrappers import read_back
+from tests.wrappers.toys import Mirrored, Plain
 
 NEEDED = {"sb3": "stable_baselines3", "rsl_rl": "rsl_rl", "skrl": "skrl"}
 ENVS = {"sb3": Plain(), "rsl_rl": Mirrored(), "skrl": Mirrored()}  # with observations of the critic's own, but for SB3

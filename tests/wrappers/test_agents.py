@@ -10,16 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from toys import Counter, Plain  # noqa: E402
-
-from bayessim_mjx import play, registry, train  # noqa: E402
-from bayessim_mjx.config import load, replace  # noqa: E402
-from bayessim_mjx.errors import UserError  # noqa: E402
-from bayessim_mjx.monitor.writers import read  # noqa: E402
-from bayessim_mjx.runs import Run, latest_run  # noqa: E402
-from bayessim_mjx.wrappers import agents  # noqa: E402
-from bayessim_mjx.wrappers.agents import networks  # noqa: E402
+from bayessim_mjx import play, registry, train
+from bayessim_mjx.config import load, replace
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.monitor.writers import read
+from bayessim_mjx.runs import Run, latest_run
+from bayessim_mjx.wrappers import agents
+from bayessim_mjx.wrappers.agents import shared
+from tests.wrappers.toys import Counter, Plain
 
 ENVS = {"sb3": Plain(), "rsl_rl": Counter(), "skrl": Counter()}  # both networks of SB3 see the same
 NEEDED = {"sb3": "stable_baselines3", "rsl_rl": "rsl_rl", "skrl": "skrl"}
@@ -78,10 +76,10 @@ def test_a_network_by_hand():
     """elu(x W + b) v with observations (x - 1) / 2."""
     config = settings("sb3").ppo
     layers = [(np.array([[2.0]]), np.array([1.0])), (np.array([[0.1]]), np.array([0.0]))]
-    policy = networks.policy(layers, np.array([-1.0]), config, mean=[1.0], scale=[2.0])
+    policy = shared.policy_of(layers, np.array([-1.0]), config, mean=[1.0], scale=[2.0])
     np.testing.assert_allclose(policy.act(None, jnp.array([[3.0]])), [[0.3]], rtol=1e-5)
     np.testing.assert_allclose(policy.act(None, jnp.array([[-1.0]])), [[0.1 * np.expm1(-1)]], rtol=1e-4)
-    plain = networks.policy(layers, np.array([-1.0]), config)
+    plain = shared.policy_of(layers, np.array([-1.0]), config)
     np.testing.assert_allclose(plain.act(None, jnp.array([[3.0]])), [[0.7]], rtol=1e-5)
 
 
@@ -191,7 +189,7 @@ class Steady:
 
     def policy(self):
         layers = [(np.zeros((3, 2)), np.zeros(2)), (np.zeros((2, 1)), np.zeros(1))]
-        return networks.policy(layers, np.zeros(1), settings("sb3").ppo)
+        return shared.policy_of(layers, np.zeros(1), settings("sb3").ppo)
 
     def save(self, folder):
         self.saves += 1

@@ -1,18 +1,13 @@
 """What another library's agent goes on from: also how much its scales have seen."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from toys import Counter  # noqa: E402
-
-from bayessim_mjx import registry, train  # noqa: E402
-from bayessim_mjx.config import load  # noqa: E402
-from bayessim_mjx.runs import Run, latest_run  # noqa: E402
-from bayessim_mjx.wrappers import agents  # noqa: E402
+from bayessim_mjx import registry, train
+from bayessim_mjx.config import load
+from bayessim_mjx.runs import Run, latest_run
+from bayessim_mjx.wrappers import agents
+from tests.wrappers.toys import Counter
 
 NEEDED = {"sb3": "stable_baselines3", "rsl_rl": "rsl_rl", "skrl": "skrl"}
 SEEN = {  # (observations that the scale of the policy has seen, their mean)

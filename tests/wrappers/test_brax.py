@@ -1,8 +1,5 @@
 """Brax's trainer on our tasks and our trainer on Brax's and Playground's environments."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,9 +12,7 @@ from bayessim_mjx.registry import make
 from bayessim_mjx.rollout import rollout
 from bayessim_mjx.wrappers.brax import BraxEnv, ours, train
 from bayessim_mjx.wrappers.fresh import wrap
-
-sys.path.insert(0, str(Path(__file__).parent))
-from toys import Counter  # noqa: E402
+from tests.wrappers.toys import Counter
 
 CONFIG = PPOConfig(num_envs=8, num_steps=4, num_epochs=1, num_minibatches=2, hidden_actor=(8,), hidden_critic=(8,))
 

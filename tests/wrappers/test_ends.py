@@ -4,22 +4,18 @@ The counter's critic says the number of steps, so that the last observation is w
 episode 0. Five rewards of 1 in each; gamma is .99, and a sixth step belongs to the next episode.
 """
 
-import sys
 from importlib import import_module
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from test_agent_settings import settings  # noqa: E402
-from toys import Counter, Plain  # noqa: E402
-
-from bayessim_mjx.wrappers import agents, brax, fresh  # noqa: E402
-from bayessim_mjx.wrappers.gymnasium import GymnasiumVectorEnv  # noqa: E402
-from bayessim_mjx.wrappers.worlds import Worlds  # noqa: E402
+from bayessim_mjx.wrappers import agents, brax, fresh
+from bayessim_mjx.wrappers.gymnasium import GymnasiumVectorEnv
+from bayessim_mjx.wrappers.worlds import Worlds
+from tests.wrappers.test_agent_settings import settings
+from tests.wrappers.toys import Counter, Plain
 
 NEEDED = {"sb3": "stable_baselines3", "rsl_rl": "rsl_rl", "skrl": "skrl", "rl_games": "rl_games"}
 REWARDS = [1, 1, 1, 1, 1 + 0.99 * 5, 1]  # each of six steps, with what is added where the episode ends

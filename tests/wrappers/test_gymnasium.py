@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import warnings
-from pathlib import Path
 
 import gymnasium
 import jax.numpy as jnp
@@ -16,9 +15,7 @@ from gymnasium.wrappers import vector as wrappers
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.registry import make
 from bayessim_mjx.wrappers.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "rl"))
-import probes  # noqa: E402
+from tests.rl import probes
 
 NAME = "bayessim_mjx/Pendulum-v0"
 

@@ -1,24 +1,20 @@
 """Observations that are pictures: what each library gets, that convolutions train on them, and who refuses them."""
 
-import sys
 from collections import OrderedDict
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from toys import Camera, Counter  # noqa: E402
-
-from bayessim_mjx import rl  # noqa: E402
-from bayessim_mjx.config import PPOConfig  # noqa: E402
-from bayessim_mjx.errors import UserError  # noqa: E402
-from bayessim_mjx.wrappers import pictures  # noqa: E402
-from bayessim_mjx.wrappers.gymnasium import GymnasiumEnv  # noqa: E402
-from bayessim_mjx.wrappers.spaces import boxes  # noqa: E402
-from bayessim_mjx.wrappers.worlds import Worlds  # noqa: E402
+from bayessim_mjx import rl
+from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.wrappers import pictures
+from bayessim_mjx.wrappers.conversion import boxes
+from bayessim_mjx.wrappers.gymnasium import GymnasiumEnv
+from bayessim_mjx.wrappers.worlds import Worlds
+from tests.wrappers.toys import Camera, Counter
 
 ENV = Camera()
 BRIGHT = [0, 40, 80, 120, 160]

@@ -1,7 +1,6 @@
 """A posterior reaches every library's worlds: episodes begin with its theta, whichever wrapper makes them."""
 
 import importlib
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from toys import Counter  # noqa: E402
-
-from bayessim_mjx.distributions import Distribution  # noqa: E402
+from bayessim_mjx.distributions import Distribution
+from tests.wrappers.toys import Counter
 
 ENV, WORLDS = Counter(), 4  # it shows its theta as the third number
 KEYS = jax.random.split(jax.random.PRNGKey(0), WORLDS)

@@ -4,19 +4,15 @@ Libraries that are not installed are skipped; `pip install 'bayessim-mjx[sb3,rsl
 """
 
 import functools
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from toys import Counter  # noqa: E402
-
-from bayessim_mjx.errors import UserError  # noqa: E402
-from bayessim_mjx.wrappers.agents.episodes import Recent  # noqa: E402
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.wrappers.agents.shared import Recent
+from tests.wrappers.toys import Counter
 
 ENV = Counter()
 NEEDED = {

@@ -1,19 +1,14 @@
 """Worlds that restart by themselves, on a counter whose episodes can be computed by hand."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from toys import Counter  # noqa: E402
-
-from bayessim_mjx.distributions import Distribution  # noqa: E402
-from bayessim_mjx.errors import UserError  # noqa: E402
-from bayessim_mjx.wrappers.worlds import Worlds, domain_of, worlds  # noqa: E402
+from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.wrappers.worlds import Worlds, domain_of, worlds
+from tests.wrappers.toys import Counter
 
 ENV = Counter()  # one object: its programs are compiled once
 

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.blind.reality.cause import Cause, Simulated
-from bayessim_mjx.blind.reality.ground import ground, lift
+from bayessim_mjx.blind.reality.links import ground, lift
 
 
 class InertialParameters(Cause):

@@ -11,8 +11,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.blind.reality.cause import Cause, Past, Scales
-from bayessim_mjx.blind.reality.ground import ground
-from bayessim_mjx.blind.reality.links import axis, chain, length, turns
+from bayessim_mjx.blind.reality.links import axis, chain, ground, length, turns
 
 FINER = 10  # times, of the steps in reality, so that its own error of integration is small beside the nominal one
 WIDTHS = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of free, ball, slide and hinge joints in qpos and qvel

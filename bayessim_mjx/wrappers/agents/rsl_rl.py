@@ -12,8 +12,8 @@ from bayessim_mjx.config import Config, RNDConfig
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import Policy, rnd, symmetry
 from bayessim_mjx.wrappers import rsl_rl
-from bayessim_mjx.wrappers.agents import networks
-from bayessim_mjx.wrappers.agents.episodes import Recent
+from bayessim_mjx.wrappers.agents import shared
+from bayessim_mjx.wrappers.agents.shared import Recent
 from bayessim_mjx.wrappers.worlds import Worlds
 
 TAKES = ("rnd", "symmetry", "normalize_advantage_per_minibatch")
@@ -124,10 +124,10 @@ class RslRlAgent:
         layers = [(m.weight.detach().cpu().numpy().T, m.bias.detach().cpu().numpy()) for m in linear]
         log_std = actor.distribution.log_std_param.detach().cpu().numpy()
         if not self.config.ppo.normalize_observations:
-            return networks.policy(layers, log_std, self.config.ppo)
+            return shared.policy_of(layers, log_std, self.config.ppo)
         seen = actor.obs_normalizer
         scale = seen.std.cpu().numpy() + seen.eps
-        return networks.policy(layers, log_std, self.config.ppo, seen.mean.cpu().numpy(), scale)
+        return shared.policy_of(layers, log_std, self.config.ppo, seen.mean.cpu().numpy(), scale)
 
     def save(self, folder: Path) -> None:
         import torch

@@ -10,8 +10,8 @@ import numpy as np
 from bayessim_mjx.config import Config
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import Policy
-from bayessim_mjx.wrappers.agents import networks
-from bayessim_mjx.wrappers.agents.episodes import Recent
+from bayessim_mjx.wrappers.agents import shared
+from bayessim_mjx.wrappers.agents.shared import Recent
 from bayessim_mjx.wrappers.sb3 import SB3VecEnv
 from bayessim_mjx.wrappers.worlds import Worlds
 
@@ -106,9 +106,9 @@ class SB3Agent:
         layers = [(m.weight.detach().cpu().numpy().T, m.bias.detach().cpu().numpy()) for m in linear]
         log_std = net.log_std.detach().cpu().numpy()
         if not self.config.ppo.normalize_observations:
-            return networks.policy(layers, log_std, self.config.ppo)
+            return shared.policy_of(layers, log_std, self.config.ppo)
         seen = self.env.obs_rms
-        return networks.policy(layers, log_std, self.config.ppo, seen.mean, np.sqrt(seen.var + self.env.epsilon))
+        return shared.policy_of(layers, log_std, self.config.ppo, seen.mean, np.sqrt(seen.var + self.env.epsilon))
 
     def save(self, folder: Path) -> None:
         import torch
@@ -131,6 +131,6 @@ class SB3Agent:
 
 
 def _device() -> str:
-    from bayessim_mjx.wrappers.tensors import torch
+    from bayessim_mjx.wrappers.conversion import torch
 
     return "cuda" if torch().cuda.is_available() else "cpu"

@@ -15,8 +15,8 @@ import numpy as np
 from bayessim_mjx.config import Config
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.wrappers import skrl
-from bayessim_mjx.wrappers.agents import networks
-from bayessim_mjx.wrappers.agents.episodes import Recent
+from bayessim_mjx.wrappers.agents import shared
+from bayessim_mjx.wrappers.agents.shared import Recent
 from bayessim_mjx.wrappers.worlds import Worlds
 
 TAKES = ()
@@ -117,10 +117,10 @@ class SkrlAgent:
         layers = [(net[name]["kernel"], net[name]["bias"]) for name in names]
         log_std = params["log_std_parameter"]
         if not self.config.ppo.normalize_observations:
-            return networks.policy(layers, log_std, self.config.ppo)
+            return shared.policy_of(layers, log_std, self.config.ppo)
         seen = self.agent._observation_preprocessor
         scale = np.sqrt(np.asarray(seen.running_variance)) + seen.epsilon
-        return networks.policy(layers, log_std, self.config.ppo, seen.running_mean, scale)
+        return shared.policy_of(layers, log_std, self.config.ppo, seen.running_mean, scale)
 
     def _tree(self) -> dict[str, Any]:
         """All that learning goes on with, as arrays."""

@@ -2,19 +2,15 @@
 
 import copy
 import dataclasses
-import sys
-from pathlib import Path
 
 import pytest
+import rigs
 
 from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check, lead, proposed
 from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import enumerate_candidates
 from bayessim_mjx.diagnosis.phrases import first_look
 from bayessim_mjx.effects import load as effect
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "benchmarks" / "diagnosis"))
-rigs = pytest.importorskip("rigs")
 
 LOAD = rigs.Truth("payload", "tool", (1.0, 0.05, 0.0, 0.02))
 WEAK = rigs.Truth("actuator_gain", "elbow_motor", (0.8,))

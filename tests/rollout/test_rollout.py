@@ -1,22 +1,17 @@
 """Whole episodes, auto-resetting collection, and replay of commands."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent / "rl"))
-import probes  # noqa: E402
-
-from bayessim_mjx.config import PPOConfig  # noqa: E402
-from bayessim_mjx.registry import make  # noqa: E402
-from bayessim_mjx.rl import networks, normalise  # noqa: E402
-from bayessim_mjx.rollout import collect, replay, rollout  # noqa: E402
-from bayessim_mjx.rollout.collection import _stride  # noqa: E402
-from bayessim_mjx.rollout.episodes import _rollout  # noqa: E402
+from bayessim_mjx.config import PPOConfig
+from bayessim_mjx.registry import make
+from bayessim_mjx.rl import networks, normalise
+from bayessim_mjx.rollout import collect, replay, rollout
+from bayessim_mjx.rollout.collection import _stride
+from bayessim_mjx.rollout.episodes import _rollout
+from tests.rl import probes
 
 
 def key(seed):
