@@ -75,7 +75,7 @@ def of_package(task: str) -> tuple[film.Motion, Any, str]:
 
 
 def _acting(env: Any, policy: Any) -> film.Motion:
-    """An episode, or as many as fill the film."""
+    """Run an episode, or as many as fill the film."""
     theta, shown, steps = jnp.asarray(env.space.nominal, jnp.float32), [], round(SECONDS / env.dt)
     while sum(len(one.total) for one in shown) < steps:
         key = jax.random.PRNGKey(len(shown))
@@ -116,7 +116,7 @@ def swaying(task: str) -> tuple[film.Motion, Any, str]:
 
 
 def motion_of(task: str, runs: Path | None) -> tuple[film.Motion, Any, str]:
-    """What there is to show of a task."""
+    """Record what there is to show of a task."""
     if runs is not None:
         try:
             return of_run(task, runs)
@@ -126,7 +126,7 @@ def motion_of(task: str, runs: Path | None) -> tuple[film.Motion, Any, str]:
 
 
 def palette(frames: np.ndarray, count: int) -> np.ndarray:
-    """The colours [count, 3] of a film, by k-means over the square roots of how often each is there.
+    """Choose the colours [count, 3] of a film, by k-means over the square roots of how often each is there.
 
     Going by the pixels alone, the tones of the ground would leave nothing for a small ball or the robot's body.
     """
@@ -177,7 +177,7 @@ def make(task: str, runs: Path | None) -> str | None:
 
 
 def captioned(page: str, shown: dict[str, str]) -> str:
-    """The page of films, with what each of them shows."""
+    """Write the page of films, with what each of them shows."""
     for task, words in shown.items():
         page = re.sub(rf"(\*\*{task}\*\*: .*Shown: ).*?\.( \|)", rf"\g<1>{words}.\g<2>", page)
     return page

@@ -70,7 +70,7 @@ def in_terminal(words: list[str], work: Path, name: str) -> str:
 
 
 def _read(main: int) -> bytes:
-    """What there is; empty at the end, which Linux tells by an error."""
+    """Read what there is; empty at the end, which Linux tells by an error."""
     try:
         return os.read(main, 65536)
     except OSError:
@@ -118,7 +118,7 @@ class Screen:
             self.column += 1
 
     def texts(self) -> list[Text]:
-        """The lines with their styles, without empty ones at the end."""
+        """List the lines with their styles, without empty ones at the end."""
         found = []
         for line in self.lines:
             parts = ((style, "".join(c for _, c in run)) for style, run in groupby(line, key=lambda cell: cell[0]))
@@ -129,7 +129,7 @@ class Screen:
 
 
 def terminal_picture(text: str, title: str, out: Path) -> None:
-    """The last state of a terminal as SVG, with the viewer's own monospaced font."""
+    """Draw the last state of a terminal as SVG, with the viewer's own monospaced font."""
     screen = Screen()
     screen.write(text)
     console = Console(record=True, width=COLUMNS, file=io.StringIO())
@@ -168,7 +168,7 @@ def loop_pictures(work: Path, out: Path) -> None:
 
 
 def record_motion(folder: Path) -> None:
-    """The logs of examples/diagnose_pendulum.py."""
+    """Record the logs of examples/diagnose_pendulum.py."""
     place = importlib.util.spec_from_file_location("example", ROOT / "examples" / "diagnose_pendulum.py")
     assert place is not None and place.loader is not None
     example = importlib.util.module_from_spec(place)

@@ -40,7 +40,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def table(name: str) -> str:
-    """The Markdown table of a section of the settings, of all effects, or of the parts of walking robots."""
+    """Write the Markdown table of a section of the settings, of all effects, or of the parts of walking robots."""
     if name == "effects":
         head = ["effect", "place", "law", "parameters"]
         rows = [row for file in sorted(EFFECTS.glob("*.py")) for row in _effects(file)]

@@ -49,7 +49,7 @@ class Policy:
             raise SystemExit(f"{path}: add to OBSERVED how to get {', '.join(unknown)} from joints")
 
     def check(self) -> float:
-        """The largest difference to the actions that were stored with the policy."""
+        """Return the largest difference to the actions that were stored with the policy."""
         golden = {name: self.facts.get(f"golden_{name}") for name in ("observation", "memory")}
         given = {name: np.array(x, np.float32) for name, x in golden.items() if x is not None}
         return float(np.abs(self.session.run(["action"], given)[0] - np.array(self.facts["golden_action"])).max())
@@ -95,11 +95,11 @@ class Robot:
         return dict(zip(self.joints, map(float, q), strict=True)), dict(zip(self.joints, map(float, w), strict=True))
 
     def write(self, command: np.ndarray) -> None:
-        """The command that holds from now on."""
+        """Set the command that holds from now on."""
         self.data.ctrl[self.drives] = command
 
     def efforts(self) -> np.ndarray:
-        """Forces of the actuators, N or N m."""
+        """Return the forces of the actuators, N or N m."""
         return self.data.actuator_force[self.drives]
 
     def wait(self, seconds: float) -> None:
@@ -108,12 +108,12 @@ class Robot:
             self.mujoco.mj_step(self.model, self.data)
 
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """Allowed positions of the joints that have limits."""
+        """Return the allowed positions of the joints that have limits."""
         limited = [name for name in self.joints if self.model.joint(name).limited[0]]
         return {name: tuple(self.model.joint(name).range) for name in limited}
 
     def command_ranges(self) -> np.ndarray:
-        """Allowed commands [2, A]."""
+        """Return the allowed commands [2, A]."""
         limited = self.model.actuator_ctrllimited[self.drives].astype(bool)
         return np.where(limited, self.model.actuator_ctrlrange[self.drives].T, [[-np.inf], [np.inf]])
 

@@ -26,7 +26,7 @@ SECONDS, RUNS, NOISE = 6.0, 8, 2e-3  # s, logs, rad
 
 
 def real_pendulum(env: Task) -> mujoco.MjModel:
-    """What stands on the bench."""
+    """Make the pendulum that stands on the bench."""
     spec = env.spec()
     spec.option.timestep = env.dt / 10
     spec.option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # friction is a constraint: these are on

@@ -39,5 +39,5 @@ def hovering(
 
 
 def left_right(joints: dict[str, str], task: tuple[str, ...] = ()) -> Mirror:
-    """The mirror y -> -y with these images of joints and of entries of the task."""
+    """Make the mirror y -> -y with these images of joints and of entries of the task."""
     return Mirror(joints=joints, observations={name: f"-{name}" for name in TURNED}, normal="y", task=task)

@@ -48,7 +48,7 @@ class View(NamedTuple):
         return self.qvel[3:6]  # MuJoCo has a free joint's angular velocity in them already
 
     def asked(self, command: str) -> jax.Array:
-        """This command, m/s or rad/s; 0 where the task has none."""
+        """Return this command, m/s or rad/s; 0 where the task has none."""
         return self.world.task.get(command, jnp.zeros(()))
 
 
@@ -132,7 +132,7 @@ class Parts(Task):
         return _running.foot_loads(self.sys, self.mj_model, view.data, self.feet)
 
     def observe_actions(self, view: View) -> jax.Array:
-        """The last ones."""
+        """Actions of the last step."""
         return view.action
 
     def reward_alive(self, view: View) -> jax.Array:

@@ -4,7 +4,7 @@ FLOOR = '<geom name="floor" type="plane" size="0 0 5" material="ground" contype=
 
 
 def scene(ground: tuple[str, str] = ("0.78 0.80 0.82", "0.64 0.68 0.72"), sky: str = "0.86 0.91 0.96") -> str:
-    """The sections `visual` and `asset`; colours are "red green blue" from 0 to 1."""
+    """Write the sections `visual` and `asset`; colours are "red green blue" from 0 to 1."""
     return f"""
   <visual>
     <headlight ambient="0.4 0.4 0.4" diffuse="0.25 0.25 0.25" specular="0 0 0"/>

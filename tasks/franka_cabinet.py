@@ -121,7 +121,7 @@ def _bonus(drawer: jax.Array, around: jax.Array) -> jax.Array:
 
 
 def _ladder(drawer: jax.Array) -> jax.Array:
-    """That of 2021: the highest step that the drawer has reached."""
+    """Give the reward of 2021: the highest step that the drawer has reached."""
     steps = jnp.array([0.0, 0.01, 0.05, 0.1, 0.15, 0.2, 0.38])
     pays = jnp.array([0.0, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8, 1.0])
     return pays[jnp.sum(drawer > steps)]

@@ -135,7 +135,7 @@ class Ingenuity(Task):
         return world, jnp.where(world.task["steps"] == 0, 0.0, self.command(action))
 
     def marks(self, qpos: np.ndarray, observation: np.ndarray) -> np.ndarray:
-        """The target of each row, from where it is seen."""
+        """Mark the target of each row, from where it is seen."""
         place = qpos[:, :3] + WAY * observation[:, :3]
         return np.concatenate([place, np.tile([1.0, 0, 0, 0], (len(qpos), 1))], axis=1)[:, None]
 
@@ -150,6 +150,6 @@ class Ingenuity(Task):
         return reward, lost, metrics
 
     def _target(self, world: World) -> jax.Array:
-        """The target `[3]` (m) of the step that led to this world; the second one begins with step 501."""
+        """Return the target `[3]` (m) of the step that led to this world; the second one begins with step 501."""
         which = jnp.maximum(world.task["steps"] - 1, 0) // STEPS_PER_TARGET
         return jnp.stack([jnp.take(world.task[f"target_{i}"], which, mode="clip") for i in "xyz"])

@@ -130,7 +130,7 @@ class Locomotion(Parts):
         return np.where(drives, resting(model, data.actuator_length), 0).astype(np.float32)
 
     def initial(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The base where the model has it and at rest, joints near home."""
+        """Put the base where the model has it and at rest, joints near home."""
         key_q, key_v = jax.random.split(key)
         noise, speed = self.noise(key_q, self.spread), self.noise(key_v, self.speed_spread)
         base = jnp.asarray(self.mj_model.qpos0[:7], jnp.float32)
@@ -161,7 +161,7 @@ class Locomotion(Parts):
     def reward(
         self, before: World, after: World, data: mjx.Data, action: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
-        """The weighted parts, each a metric too."""
+        """Sum the weighted parts, each a metric too."""
         view = View(after, after.qpos, after.qvel, rotation(after.qpos[3:7]), data, action, before.qpos)
         parts = {part: weight * getattr(self, f"reward_{part}")(view) for part, weight in self.rewards.items()}
         total, fallen = sum(parts.values(), jnp.zeros(())), self.fallen(view)

@@ -51,7 +51,7 @@ class Manipulation(RateControlled):
         self._home = _home(model, self.home, self.name)
 
     def initial(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The home pose, joints with a drive anew within +-spread; at rest."""
+        """Take the home pose, joints with a drive anew within +-spread; at rest."""
         return self.near_home(key), jnp.zeros(self.mj_model.nv)
 
     def near_home(self, key: jax.Array) -> jax.Array:

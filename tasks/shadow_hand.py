@@ -169,7 +169,7 @@ class ShadowHand(Manipulation):
         return (self._pushed(world, key_push) if self.settings["forceScale"] else world), command
 
     def _pushed(self, world: World, key: jax.Array) -> World:
-        """The cube after a push in its own axes, which fades until there is another."""
+        """Push the cube in its own axes; the push fades until there is another."""
         key_when, key_how = jax.random.split(key)
         fresh = self.settings["forceScale"] * jax.random.normal(key_how, (3,))
         faded = DECAY ** (self.dt / DECAY_TIME) * world.task["push"]
@@ -184,7 +184,7 @@ class ShadowHand(Manipulation):
         )
 
     def marks(self, qpos: np.ndarray, observation: np.ndarray) -> np.ndarray:
-        """A cube beside the hand in the orientation of the goal: that of the cube, turned back by how they differ."""
+        """Mark a cube beside the hand in the goal's orientation: that of the cube, turned back by how they differ."""
         between = [self.observation_names.index(f"cube_from_goal_quaternion_{i}") for i in "wxyz"]
         goal = jax.vmap(lambda turn, cube: product(conjugate(turn), cube))(observation[:, between], qpos[:, TURN])
         place = np.broadcast_to(self.goal_place + SHOWN, (len(qpos), 3))
@@ -203,7 +203,7 @@ class ShadowHand(Manipulation):
         return {group: jnp.concatenate([parts[part] for part in TYPES[kind]]) for group, kind in kinds.items()}
 
     def _seen(self, world: World) -> dict[str, jax.Array]:
-        """The parts of observations that the sensors' positions and speeds give."""
+        """Return the parts of observations that the sensors' positions and speeds give."""
         qpos, qvel = world.measurement["qpos"], world.measurement["qvel"]
         low, high = self.mj_model.jnt_range[HAND].T.astype(np.float32)
         place, turn, goal = qpos[CUBE], qpos[TURN], world.task["goal"]
@@ -252,14 +252,14 @@ class ShadowHand(Manipulation):
 
 
 def _random_turn(key: jax.Array) -> jax.Array:
-    """A quaternion: about y and then about x, each by up to half a turn; these are not all orientations alike."""
+    """Draw a quaternion: about y and then about x, each by up to half a turn; these are not all orientations alike."""
     x, y = jnp.pi / 2 * jax.random.uniform(key, (2,), minval=-1.0)
     about_x = jnp.array([jnp.cos(x), jnp.sin(x), 0.0, 0.0])
     return product(about_x, jnp.array([jnp.cos(y), 0.0, jnp.sin(y), 0.0]))
 
 
 def _positive(quat: jax.Array) -> jax.Array:
-    """The quaternion in Isaac Gym's order, of the two that are one orientation that with w >= 0."""
+    """Return the quaternion in Isaac Gym's order, of the two that are one orientation that with w >= 0."""
     return xyzw(jnp.where(quat[0] < 0, -quat, quat))
 
 

@@ -73,7 +73,7 @@ def update(
         return error, {"Loss/behavior": error}
 
     params, opt_state, rate, figures = losses.descend(
-        epochs_key, state.params, state.opt_state, state.learning_rate, batch, config, objective, state.mesh
+        epochs_key, state.params, state.opt_state, state.learning_rate, batch, learner, objective
     )
     after = dataclasses.replace(
         ppo.moved_on(config, state, env_states, data, key), params=params, opt_state=opt_state, normalizer=normalizer

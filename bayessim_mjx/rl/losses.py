@@ -11,7 +11,6 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
-from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.rl import actions, networks, segments, sharding
 from bayessim_mjx.rl.extension import Learner
 from bayessim_mjx.rl.networks import Params
@@ -158,7 +157,7 @@ def optimise(
     def objective(params: Params, part: Batch) -> tuple[jax.Array, dict]:
         return loss(params, old_log_std, part, learner)
 
-    return descend(key, params, opt_state, learning_rate, batch, learner.config, objective, learner.mesh)
+    return descend(key, params, opt_state, learning_rate, batch, learner, objective)
 
 
 def descend(
@@ -167,9 +166,8 @@ def descend(
     opt_state: optax.OptState,
     learning_rate: jax.Array,
     batch: Any,
-    config: PPOConfig,
+    learner: Learner,
     objective: Callable[[Params, Any], tuple[jax.Array, dict]],
-    mesh: Mesh | None = None,
 ) -> tuple[Params, optax.OptState, jax.Array, dict[str, jax.Array]]:
     """Adam on objective(params, minibatch) -> (loss, figures) over all epochs of minibatches; returns as `optimise`.
 
@@ -178,13 +176,13 @@ def descend(
     Args:
         key, params, opt_state, learning_rate: as for `optimise`.
         batch: a pytree of arrays with one leading axis.
-        config: epochs, minibatches and the schedule of the rate.
+        learner: epochs, minibatches and the schedule of the rate; the devices that share each minibatch.
         objective: pure.
-        mesh: devices that share each minibatch; None: one.
     """
+    config = learner.config
     flat, unravel = ravel_pytree(params)
     size = jax.tree.leaves(batch)[0].shape[0]
-    order = minibatches(key, config.num_epochs, size, config.num_minibatches, mesh)
+    order = minibatches(key, config.num_epochs, size, config.num_minibatches, learner.mesh)
 
     def step(carry: tuple[Any, Any, Any], now: tuple[jax.Array, jax.Array]) -> tuple[Any, dict]:
         flat, opt_state, rate = carry
