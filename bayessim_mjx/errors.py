@@ -53,5 +53,5 @@ def out_of_memory(error: BaseException) -> bool:
 
 
 def refused(error: BaseException) -> bool:
-    """Whether the system refused to read or write a file, or has not the memory that was asked for."""
+    """Whether the system refused to read or write a file, or lacks the memory."""
     return out_of_memory(error) or (isinstance(error, OSError) and error.errno in _REFUSED) or disk_is_full(error)

@@ -84,7 +84,7 @@ def _write(file: Path, kept: Sequence["Measurement"]) -> None:
 
 
 def _refused(config: "Config") -> str | None:
-    """Why Warp cannot simulate the task; None: it can, as far as its model tells."""
+    """Why Warp cannot simulate the task; None: it can, judging by its model."""
     from bayessim_mjx import registry
 
     try:
@@ -175,7 +175,7 @@ def _table(rows: Sequence[dict[str, Any]], impls: Sequence[str]) -> tuple[list[s
 
 
 def _quiet() -> None:
-    """Warp tells of every kernel that it compiles, by the dozen."""
+    """Warp reports every kernel that it compiles, by the dozen."""
     import warp
 
     settings: Any = warp.config

@@ -41,7 +41,7 @@ class Kept:
 
     @property
     def count(self) -> int:
-        """Programs that were asked for, one for each set of shapes."""
+        """Programs called so far, one for each set of shapes."""
         return len(self._known)
 
     def __call__(self, *args: Any) -> Any:

@@ -17,12 +17,12 @@ _named: set[Path] = set()
 
 
 def allow(files: Iterable[str | os.PathLike]) -> None:
-    """Files whose code may run in this process, whoever asks for it."""
+    """Files whose code may run in this process, whoever names them."""
     _named.update(Path(file).expanduser().resolve() for file in files)
 
 
 def check(file: Path, spec: str, what: str = "effect") -> None:
-    """UserError where the user has not named `file`, which a settings file asks for as the `what` called `spec`."""
+    """UserError where the user has not named `file`, which a settings file names as the `what` called `spec`."""
     if file.resolve() not in _named:
         raise UserError(
             f"{what} {spec!r}: settings name code of yours, which runs only where you name it too; read {file}, then "

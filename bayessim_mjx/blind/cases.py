@@ -22,7 +22,7 @@ from bayessim_mjx.logs import Channels
 
 # choices, by no measurement
 GIVE_UP = 4  # times that an effect is halved because the motion does not stay finite
-EFFORT_NOISE = 0.01  # of its root mean square (told in docs/blind.md)
+EFFORT_NOISE = 0.01  # of its root mean square (docs/blind.md)
 
 
 @dataclasses.dataclass(frozen=True)

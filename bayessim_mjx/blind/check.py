@@ -1,4 +1,4 @@
-"""What a blind check was asked for, the rig that follows from it, and where its files lie."""
+"""The settings of a blind check, the rig that follows from it, and where its files lie."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ def effects_of(text: str) -> tuple[str, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """What was asked for.
+    """The settings of a blind check.
 
     Attributes:
         model: path of an MJCF file, or task: name of a task; data: files or folders of logs, () for a menu of motions.

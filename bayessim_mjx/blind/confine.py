@@ -25,7 +25,7 @@ class _Ruleset(ctypes.Structure):
 
 class _Beneath(ctypes.Structure):
     _pack_ = 1
-    _layout_ = "ms"  # Python 3.14 asks for it where a structure is packed
+    _layout_ = "ms"  # Python 3.14 wants it where a structure is packed
     _fields_ = (("allowed", ctypes.c_uint64), ("folder", ctypes.c_int32))
 
 

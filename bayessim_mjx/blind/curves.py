@@ -15,7 +15,7 @@ import numpy as np
 # What is believed before any case, by choice. That intervals hold as often as they say was counted on simulated checks
 # alone (benchmarks/blind/calibration.py, benchmarks/records/blind_strengths.json).
 LAPSE = 0.02  # of what is easily seen, missed for other reasons: within the 0 to 6 % of Wichmann and Hill (2001)
-WANTED = 0.9  # how often the strength is found that is told
+WANTED = 0.9  # how often the strength is found that is reported
 LEVEL = 0.9  # of intervals
 THRESHOLD = np.linspace(
     np.log(0.3), np.log(3000.0), 185

@@ -15,7 +15,7 @@ from bayessim_mjx.blind.runner import trials
 
 # rules of thumb, not measured
 STEEP = (0.3, 2.0)  # how an amount may grow with strength: its power, 1 where effects act in proportion
-SHARP = 15.0  # largest strength over smallest of an interval that is worth a sentence
+SHARP = 15.0  # largest strength over smallest of an interval that gets a sentence
 PLOTTED = np.geomspace(1.0, 300.0, 41)
 Found = dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""What a diagnosis.json is worth against an opened truth."""
+"""A diagnosis.json judged against an opened truth."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ class Outcome:
         return any(self.same(f["name"], str(f["where"]), effect) for f in self.named())
 
     def inside(self, effect: Mapping[str, Any]) -> bool:
-        """Named, or in the set of what cannot be told from what is named or from known parameters that are far off."""
+        """Named, or not to be separated by these logs from what is named or from known parameters that are far off."""
         return any(self.same(*label, effect) for label in self.members())
 
     def members(self) -> list[tuple[str, str]]:

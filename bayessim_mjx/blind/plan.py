@@ -12,7 +12,7 @@ import numpy as np
 from bayessim_mjx.blind.cases import Item
 from bayessim_mjx.blind.curves import Curves, Group, Trial
 
-# Which cases are made is a choice, told in docs/blind.md; it makes intervals wider or narrower, not wrong.
+# Which cases are made is a choice (docs/blind.md); it makes intervals wider or narrower, not wrong.
 KINDS = "SSSNSSSSUN"  # single, null, unknown cause; over and over
 FIRST, ROUND = 16, 8  # cases of the first round and of the others
 BEHIND = 4  # rounds after which a round's outcomes count: the strengths of the first ones are spread widely

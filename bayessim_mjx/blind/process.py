@@ -77,6 +77,6 @@ def _waited(process: subprocess.Popen[bytes]) -> float:
     if not hasattr(os, "wait4"):
         process.wait()
         return math.nan
-    _, status, used = os.wait4(process.pid, 0)  # what it cost is told once, to who waits for it
+    _, status, used = os.wait4(process.pid, 0)  # the system gives what it cost once, to who waits for it
     process.returncode = os.waitstatus_to_exitcode(status)
     return used.ru_utime + used.ru_stime

@@ -1,1 +1,1 @@
-"""What a correction of the simulator is worth: policies trained on each simulator, judged on all of them."""
+"""Value of a correction of the simulator: policies trained on each simulator, judged on all of them."""

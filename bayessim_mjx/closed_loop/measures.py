@@ -1,4 +1,4 @@
-"""What a correction of the simulator is worth in closed loop: gap of the return, ranking, recovery, relevance.
+"""Value of a correction of the simulator in closed loop: gap of the return, ranking, recovery, relevance.
 
 Measures of gap diagnosis 3.10; numbers in, numbers out.
 """

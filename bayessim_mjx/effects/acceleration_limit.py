@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.site import Site
 
-SOFT = 1e-12  # of inertness, in squared units of time: what is quicker is not told from a jump, and 1 / b overflows
+SOFT = 1e-12  # of inertness, in squared units of time: what is quicker counts as a jump, and 1 / b overflows
 SHORT = 2.0**-23  # of time: what float32 cannot place within a unit; a power of two, so that rest is exact
 STILL = 1e-9  # of slowness, in units of time: no limit of speed
 

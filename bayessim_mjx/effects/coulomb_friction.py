@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class CoulombFriction(Effect):
-    """F = -level sgn(w), set-valued at rest; `friction.dry` tells how it is computed.
+    """F = -level sgn(w), set-valued at rest; see `friction.dry`.
 
     Parameters: `level`, N m (hinge) or N (slide), neutral 0.
 

@@ -66,7 +66,7 @@ class Effect(abc.ABC):
     # for people; where these are empty, `support.words` says something by name and docstring
     noun: ClassVar[str] = ""  # what it is called: "command delay"
     lacks: ClassVar[str] = ""  # after "the simulator lacks", where that is not the noun: "a command delay"
-    separates: ClassVar[str] = ""  # the experiment that tells it from its look-alikes
+    separates: ClassVar[str] = ""  # the experiment that separates it from its look-alikes
     # whether its memory at a start in the middle of a log is found by taking it along the recorded motion before
     follows: ClassVar[bool] = False
     witness: ClassVar[tuple[str, str] | None] = None  # (stream of a log that shows it directly, what to record)

@@ -1,4 +1,4 @@
-"""Effort loss: the more an actuator is asked for, the smaller the share that arrives.
+"""Effort loss: the larger the effort that an actuator shall give, the smaller the share that arrives.
 
 One form of several causes, which a log of motion alone cannot tell apart: supply voltage sagging under load, winding
 resistance growing with current, a nonlinear duty cycle, magnetic saturation of the iron.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class LoadFriction(Effect):
-    """F = -(cm |tau_m| + ce |tau_e|) sgn(w), set-valued at rest; `friction.dry` tells how it is computed.
+    """F = -(cm |tau_m| + ce |tau_e|) sgn(w), set-valued at rest; see `friction.dry`.
 
     tau_m: force of all actuators on the joint, effects on actuators included. tau_e: what gravity, Coriolis forces,
     springs and fluid press on the joint, without its own damping (a loss of the gear, no load) and without inertial

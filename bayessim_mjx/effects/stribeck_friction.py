@@ -22,7 +22,7 @@ _SLOWEST = 1e-6  # keeps w / ws finite
 
 @dataclasses.dataclass(frozen=True)
 class StribeckFriction(Effect):
-    """F = -(fc + fs exp(-(w / ws)^2)) sgn(w), up to fc + fs at rest; `friction.dry` tells how it is computed.
+    """F = -(fc + fs exp(-(w / ws)^2)) sgn(w), up to fc + fs at rest; see `friction.dry`.
 
     Parameters: `level` fc and `excess` fs, N m (hinge) or N (slide), neutral 0; `speed` ws, rad/s or m/s, without
     effect where fs = 0.

@@ -23,7 +23,7 @@ HOLD = 1.0  # seconds for which the last pose of an episode that ended early is 
 
 @dataclass(frozen=True)
 class Motion:
-    """One episode, until its end or the last step asked for."""
+    """One episode, until its end or the last step."""
 
     qpos: np.ndarray  # [T+1, nq]
     total: np.ndarray  # [T+1] return so far

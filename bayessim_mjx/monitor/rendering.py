@@ -37,7 +37,7 @@ def backends() -> list[str]:
 def _open(width: int, height: int) -> Any:
     """Open a current OpenGL context; None with one warning where there is none.
 
-    MuJoCo fixes its backend when it is first imported, long before anybody asks for a video; so the context is made
+    MuJoCo fixes its backend when it is first imported, long before the first video; so the context is made
     here from the backend's own module and works whatever was imported before.
     """
     failures = []
@@ -104,7 +104,7 @@ def render(
 class Renderer:
     """Pictures of one model, on an OpenGL context of its own that lasts until `close` or until nobody has it any more.
 
-    The context takes several times as long to make as a picture, so who asks for single pictures keeps it.
+    The context takes several times as long to make as a picture, so callers that draw single pictures keep it.
     """
 
     @classmethod

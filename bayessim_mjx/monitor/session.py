@@ -99,7 +99,7 @@ class Session:
         self.inference.text(SETTINGS, text, code=True)
 
     def _compiled(self, what: str) -> bool:
-        """Whether there was compiling worth a line; says so."""
+        """Whether there was compiling long enough for a line; prints it."""
         seconds, cached = self.compiling.take()
         if seconds > WORTH_SAYING:
             self.console.compile(what, seconds, cached)
@@ -159,7 +159,7 @@ class Session:
         if info.moves:
             self.inference.text("BayesSim/range_ends", "\n\n".join(p.sentence() for p in info.moves), info.round + 1)
         self.flush()
-        self.compiling.take()  # the plots' small programs are not worth a line
+        self.compiling.take()  # the plots' small programs get no line
         self._phase(info.round + 1)
 
     def _plots(self, info: RoundInfo) -> None:

@@ -61,7 +61,7 @@ def record(
     strip = 0 if captions is None else strip_of(height)
     try:
         tiles = render(mj_model, worlds, width, height - strip, camera, marks)
-    except Exception as error:  # drivers fail in many ways, and a picture is never worth a run
+    except Exception as error:  # drivers fail in many ways, and no picture may end a run
         if isinstance(error, ValueError):
             raise
         warn_once(f"no video: rendering failed ({type(error).__name__}: {error})")

@@ -28,7 +28,7 @@ Figures = dict[str, jax.Array]  # by TensorBoard tag
 
 @dataclass(frozen=True)
 class Learner:
-    """What the hooks are told of the training; none of it is traced."""
+    """What the hooks know of the training; none of it is traced."""
 
     env: Any  # as the learner sees it: with what extensions show
     config: PPOConfig

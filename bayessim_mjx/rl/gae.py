@@ -15,8 +15,8 @@ def gae(
 ) -> tuple[jax.Array, jax.Array]:
     """Advantages and returns, [T, ...] each, from time-major arrays [T, ...].
 
-    `next_value` is the value of the *true* next observation, before any reset: a termination is worth nothing
-    afterwards, a truncation (time limit) is worth what the critic says. Both end the sum of an episode.
+    `next_value` is the value of the *true* next observation, before any reset: after a termination the value is 0,
+    after a truncation (time limit) it is the critic's. Both end the sum of an episode.
     unroll: steps per turn of the loop.
     """
     # delta_t = r_t + gamma (1 - terminated_t) V(s_{t+1}) - V(s_t)

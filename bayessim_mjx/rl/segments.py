@@ -51,7 +51,7 @@ def renewed(params: networks.Params, batch: Any, config: PPOConfig) -> tuple[Any
 
     Inside a segment the next value is that of the next observation seen, but the one from the collection where an
     episode is cut off: the true next observation is then not the next one seen. No gradient flows through advantages
-    and returns; the values [S L] are those to learn from, so that the critic is asked once.
+    and returns; the values [S L] are those to learn from, so that the critic is evaluated once.
     """
     act, future = networks.form(config), batch.future
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), dataclasses.replace(batch, future=None))

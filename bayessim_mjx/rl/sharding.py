@@ -1,7 +1,7 @@
 """Worlds spread over the devices of a mesh: one program for one device and for many, of one process or of several.
 
 What belongs to worlds lies where they live, all else on every device; the compiler puts the sums over devices in. What
-is simulated is told to be local, as no world needs another. A mesh of None is one device, and nothing is done.
+is simulated is declared local, as no world needs another. A mesh of None is one device, and nothing is done.
 """
 
 from collections.abc import Callable

@@ -64,7 +64,7 @@ def images(x: jax.Array, parts: Sequence[SignedPermutation]) -> jax.Array:
 def augmented(batch: Batch) -> Batch:
     """Append the K copies to the B samples of a minibatch: B (1 + K). What is for KL and entropy stays B.
 
-    A copy was drawn by the mirrored policy, which tells how often it occurs: by its weight p(M a | M s) / p(a | s),
+    A copy was drawn by the mirrored policy, so it counts by its weight p(M a | M s) / p(a | s),
     held at 1, it counts as if the policy itself had drawn it. Without, what a policy far from symmetric would never do
     drives it away (Ant: returns fell from 3000 to 1000).
     """

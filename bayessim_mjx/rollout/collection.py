@@ -91,7 +91,7 @@ def strong(tree: Any) -> Any:
 def next_episodes(env: Env, ended: jax.Array, after: State, fresh: State) -> State:
     """`fresh` resets [N] of worlds that went on to `after`, with what these carry on from episode to episode.
 
-    Training's clock goes on; where `frequency` asks for it, an ended world keeps its parameters, gravity and lasting
+    Training's clock goes on; by `frequency` an ended world keeps its parameters, gravity and lasting
     noise, and is reset anew with them.
 
     Args:

@@ -1,7 +1,7 @@
 """One checkpoint: a pytree of arrays and a JSON index, written by Orbax into a folder that appears whole or not at all.
 
 The index holds every leaf's name, shape, dtype and SHA-256, and what the numbers of distributions and networks mean
-(their `coordinates`): a damaged or foreign checkpoint is told from a good one.
+(their `coordinates`): so a damaged or foreign checkpoint is recognised.
 """
 
 import errno

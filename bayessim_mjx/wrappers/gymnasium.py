@@ -162,7 +162,7 @@ class GymnasiumVectorEnv(VectorEnv):
     Args:
         autoreset_mode: when an ended world restarts. "NextStep" (Gymnasium's default): in the next step, whose action
             is not used and whose reward is 0. "SameStep": in the same step; the last observation of the episode is
-            info["final_obs"][i] where info["_final_obs"][i]. "Disabled": not before `reset` is asked to.
+            info["final_obs"][i] where info["_final_obs"][i]. "Disabled": not before a call of `reset`.
 
     `reset(options=...)` takes `reset_mask` (bool `[num_envs]`: only these worlds) and `theta` (`[d]` or
     `[num_envs, d]`: parameters of the worlds that are reset, from then on).

@@ -1,4 +1,4 @@
-"""Pictures of worlds that are asked for one by one, as Gymnasium's and Stable-Baselines3's `render` do."""
+"""Pictures of worlds, drawn one by one, as Gymnasium's and Stable-Baselines3's `render` do."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -47,7 +47,7 @@ class Camera:
         try:
             renderer, view = _kept(self._scenes, theta.tobytes(), RENDERERS, lambda: _scene(model))
             return None if renderer is None else renderer.frames(qpos[None], view, marks)[0]
-        except Exception as error:  # drivers fail in many ways, and a picture is never worth a run
+        except Exception as error:  # drivers fail in many ways, and no picture may end a run
             warn_once(f"no picture: rendering failed ({type(error).__name__}: {error})")
             return None
 

@@ -58,7 +58,7 @@ class RslRlVecEnv(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, steps: Any) -> None:
-        """As `init_at_random_ep_len` asks: the running episodes end as if they were `steps` old."""
+        """For `init_at_random_ep_len`: the running episodes end as if they were `steps` old."""
         self.worlds.set_lengths(to_jax(steps.int(), self._jax_device))
 
     def get_observations(self) -> TensorDict:

@@ -33,7 +33,7 @@ class SB3VecEnv(VecEnv):
     """`worlds` for SB3; observations are the group "policy", as numpy arrays.
 
     `env_method("set_theta", theta)` sets the physics of episodes that begin from then on, `theta` `[d]` or
-    `[num_envs, d]` (None: as by the domain); `get_attr("theta")` tells that of the running ones.
+    `[num_envs, d]` (None: as by the domain); `get_attr("theta")` gives that of the running ones.
     """
 
     def __init__(self, worlds: Worlds, render_mode: str | None = None) -> None:

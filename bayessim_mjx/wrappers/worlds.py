@@ -240,7 +240,7 @@ def worlds(task: Any, num_envs: int = 64, domain: Any = None, seed: int = 0, **e
 def environment(
     task: Any, domain: Any = None, env_settings: Mapping[str, Any] | None = None, num_envs: int | None = None
 ) -> tuple[Env, Distribution | None]:
-    """(environment, distribution over its theta) that `worlds` is asked for; num_envs: what `impl="auto"` goes by."""
+    """(environment, distribution over its theta) of the arguments of `worlds`; num_envs: what `impl="auto"` goes by."""
     settings, together = dict(env_settings or {}), {} if num_envs is None else {"numEnvs": num_envs}
     if isinstance(task, Path) or (isinstance(task, str) and Path(task).is_dir()):
         config, checkpoint = run_of(task)

@@ -1,4 +1,4 @@
-"""Can a hidden cause be told from every other one by these logs? From the truth alone, never from the library.
+"""Do these logs separate a hidden cause from every other one? From the truth alone, never from the library.
 
 Every other cause of the generator is put in the place of the hidden one, sized as well as it can be, with the base
 parameters within their spread and the start states free; what is left of the gap, without noise, is how far the two are

@@ -11,7 +11,7 @@ from bayessim_mjx.blind.reality.plant import Plant, Run
 QUANTUM = 2 * np.pi / 16384  # rad, of an encoder of 14 bits
 # a choice of what experimenters do; the cases of benchmarks/diagnosis have the same
 SECONDS = 4.0
-RISE = 0.25  # s, of a step, so that a step asks for an effort that drives have
+RISE = 0.25  # s, of a step, so that a step needs an effort that drives have
 # (operating condition, profile, amplitude and pace as multiples of the system's)
 RUNS = (
     ("slow_triangle", "triangle", 1.0, 0.35),
@@ -130,7 +130,7 @@ class System:
 
 
 def reference(profile: str, amplitude: np.ndarray, pace: float, rng: np.random.Generator) -> Reference:
-    """Motion around zero, `[n]` at any time: joints at different paces and phases, so that they can be told apart."""
+    """Motion around zero, `[n]` at any time: joints at different paces and phases, so that they can be separated."""
     n = len(amplitude)
     paces = pace * rng.uniform(0.75, 1.25, n)
     phases = rng.uniform(0, 1, n)

@@ -1,4 +1,4 @@
-"""Causes with the parameters that a diagnosis names: what its correction is worth in the finer reality itself."""
+"""Causes with the parameters that a diagnosis names: how much its correction closes in the finer reality."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -154,7 +154,7 @@ def closed(ruler: Ruler, truth: Plant, corrected: Plant) -> float | None:
 
 
 def base_of(parameters: Mapping[str, Mapping[str, float]], names: Sequence[str]) -> dict[str, float]:
-    """Factors of the known parameters in a diagnosis.json, 1 where it does not tell one; {} where it tells none."""
+    """Factors of the known parameters in a diagnosis.json, 1 where it has none; {} where it has no factors."""
     given = {n: parameters.get(n.rpartition(".")[0] + "_" + n.rpartition(".")[2] + "_mult") for n in names}
     if not any(given.values()):
         return {}

@@ -55,7 +55,7 @@ class VaryingGain(ChangingGain):
 
 
 class Pushes(Cause):
-    """Somebody pushes at times that no log tells."""
+    """Somebody pushes at times that no log has."""
 
     name = "unknown_pushes"
     kind = "body"

@@ -15,7 +15,7 @@ class Words:
         noun: what people call it.
         kind: of its places; "" where the effect is not known.
         lacks: what a simulator lacks that lacks it.
-        separates: what experiment tells it from look-alikes; "" where nothing is known of it.
+        separates: the experiment that separates it from look-alikes; "" where nothing is known of it.
         witness: (stream of a log that shows it directly, what to record), or None.
     """
 

@@ -75,7 +75,7 @@ def check(config: Config, env: Any) -> Any:
 
 
 def refuse(config: Config, takes: Sequence[str], activations: Collection[str]) -> None:
-    """UserError for the first setting that asks for what `config.agent` has not."""
+    """UserError for the first setting that `config.agent` does not have."""
     if config.bayessim.policyCheckpt is not None:
         raise UserError(f"--checkpoint: --agent {config.agent} begins with a policy of its own; leave it out")
     if config.devices != "1":

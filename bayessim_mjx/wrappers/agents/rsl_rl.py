@@ -1,4 +1,4 @@
-"""rsl_rl's PPO, with its random network distillation and symmetry where `ppo:` asks for them."""
+"""rsl_rl's PPO, with its random network distillation and symmetry where `ppo:` has them."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class RslRlAgent:
         return settings | {"num_steps_per_env": ppo.num_steps}
 
     def _updated(self) -> dict[str, float]:
-        """Its update, which tells the losses to its own log alone."""
+        """Its update, which writes the losses to its own log alone."""
         found = self._update()
         self.losses = {f"Loss/{name}": float(found[name]) for name in LOSSES if name in found}
         return found
