@@ -118,7 +118,7 @@ def _video(config: Config, env: Any, policy: Any, physics: tuple[str, Any], key:
     import numpy as np
 
     from bayessim_mjx.monitor import film, video
-    from bayessim_mjx.monitor.names import without_prefix
+    from bayessim_mjx.monitor.tables import without_prefix
 
     if not hasattr(env, "physics"):
         raise UserError(f"--video: {env.name} has no MuJoCo model of ours to draw; leave it out")

@@ -15,9 +15,8 @@ from typing import Any, TextIO
 
 from bayessim_mjx.config import Config
 from bayessim_mjx.monitor.clock import Clock
-from bayessim_mjx.monitor.names import named, shorten, spoken, without_prefix
 from bayessim_mjx.monitor.output import Bars, Output
-from bayessim_mjx.monitor.tables import TIE, fit
+from bayessim_mjx.monitor.tables import TIE, fit, named, shorten, spoken, without_prefix
 from bayessim_mjx.quantities import compact, duration, estimate, is_number, spread
 
 WIDTHS = "posterior/prior sd"

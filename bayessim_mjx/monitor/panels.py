@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.monitor.draws import Draws, density, density2, levels
-from bayessim_mjx.monitor.names import shorten
 from bayessim_mjx.monitor.style import BLUE, DASHED, GREEN, GREY, NAVY, RED, YELLOW, blues, size_of
+from bayessim_mjx.monitor.tables import shorten
 from bayessim_mjx.quantities import compact, spread
 
 Limits = tuple[float, float]

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.monitor.draws import Draws, draws_of
-from bayessim_mjx.monitor.names import shorten
 from bayessim_mjx.monitor.panels import (
     best_first,
     correlation,
@@ -25,6 +24,7 @@ from bayessim_mjx.monitor.panels import (
 )
 from bayessim_mjx.monitor.predictive import predictive
 from bayessim_mjx.monitor.style import BLUE, GREEN, GREY, RED, handles, head, heading, new_figure, size_of
+from bayessim_mjx.monitor.tables import shorten
 from bayessim_mjx.quantities import compact, fixed, percent, percent_estimate
 
 __all__ = ["corner", "pair", "predictive"]

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.monitor.names import shorten
 from bayessim_mjx.monitor.style import BLUE, GREEN, handles, heading, new_figure
+from bayessim_mjx.monitor.tables import shorten
 from bayessim_mjx.quantities import percent
 
 

@@ -6,7 +6,7 @@ Posterior blue, prior green and dashed, truth red: BayesSimIG's colours, in shad
 from collections.abc import Sequence
 from typing import Any
 
-from bayessim_mjx.monitor.names import shorten
+from bayessim_mjx.monitor.tables import shorten
 
 BLUE, GREEN, RED, YELLOW, GREY, NAVY, SKY = "#0072B2", "#009E73", "#D1350F", "#F5D000", "#6B6B6B", "#003B5C", "#9CCBE8"
 DASHED = (0, (4, 2))

@@ -8,8 +8,7 @@ import pytest
 
 from bayessim_mjx.monitor.clock import Clock
 from bayessim_mjx.monitor.console import Console
-from bayessim_mjx.monitor.names import without_prefix
-from bayessim_mjx.monitor.tables import fit
+from bayessim_mjx.monitor.tables import fit, without_prefix
 
 
 class Terminal(io.StringIO):

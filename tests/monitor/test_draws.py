@@ -5,7 +5,7 @@ import pytest
 
 from bayessim_mjx.distributions.estimates import estimates
 from bayessim_mjx.monitor.draws import density, density2, levels
-from bayessim_mjx.monitor.names import shorten
+from bayessim_mjx.monitor.tables import shorten
 
 LONG = ["hand_robot0_forearm_joint_stiffness_mult", "index_finger_proximal_damping", "slider_mass_mult"]
 
