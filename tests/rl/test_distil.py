@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_privileged import DOMAIN, Luck
 
 from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig
@@ -14,6 +13,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import catalogue, distil, normalise, privileged, worlds
 from bayessim_mjx.rl.networks import Policy
 from tests.rl import probes
+from tests.rl.test_privileged import DOMAIN, Luck
 
 CONFIG = PPOConfig(
     num_envs=32, num_steps=8, num_epochs=2, num_minibatches=4, learning_rate=3e-3, hidden_actor=(16,),

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from test_distil import linear
 
 from bayessim_mjx import rl
 from bayessim_mjx.config import PPOConfig
@@ -17,6 +16,7 @@ from bayessim_mjx.keys import branch
 from bayessim_mjx.rl import actions, distil, groups, networks, recurrent
 from bayessim_mjx.rl.extension import Learner
 from tests.rl import probes
+from tests.rl.test_distil import linear
 
 CONFIG = PPOConfig(
     num_envs=16, num_steps=8, num_epochs=1, num_minibatches=2, hidden_actor=(8,), hidden_critic=(8,), log_interval=60

@@ -90,7 +90,7 @@ def refused(name):
 
 def acts_alike(agent, name):
     """Our policy of its network acts as the library's own, at observations near and far."""
-    from test_agents import actions
+    from tests.wrappers.test_agents import actions
 
     x = np.random.default_rng(1).normal(size=(32, 3)).astype(np.float32) * 3
     np.testing.assert_allclose(agent.policy().act(None, jnp.asarray(x)), actions(agent, x), atol=2e-5)
