@@ -105,7 +105,7 @@ def set_rows(sets: Any) -> list[list[str]]:
 
 
 def verdict_lines(found: Any) -> list[str]:
-    """The verdicts in words: on the network, and on whether reality looks like simulation."""
+    """State the verdicts in words: on the network, and on whether reality looks like simulation."""
     report, misfit = found.calibration, found.misfit
     lines = [f"verdict     posterior {report.words}: {ADVICE[report.verdict]}"]
     if report.temperature is not None and report.before is None:

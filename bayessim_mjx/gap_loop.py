@@ -50,7 +50,7 @@ def _parser() -> cli.Parser:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """What can be refused before anything is loaded."""
+    """Refuse what can be refused before anything is loaded."""
     if not args.diagnosis:
         raise UserError("--diagnosis is missing: give the folder that bayessim-mjx diagnose wrote")
     if not (Path(args.diagnosis) / "diagnosis.json").is_file():

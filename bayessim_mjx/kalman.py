@@ -96,7 +96,7 @@ def riccati(
 def measured_noise(
     ways: np.ndarray, gains: Gains, white: np.ndarray, dt: float, valid: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sums [2 nv] over all rows of u^2 and of its variance D, where the sensors' noise is R (u, diag(R - R D R)).
+    """Sum [2 nv] over all rows of u^2 and of its variance D, where the sensors' noise is R (u, diag(R - R D R)).
 
     The smoothed measurement noise, by a backward pass over innovations: Koopman (1993), Biometrika 80, 117. Each number
     of R then has the EM step R + R^2 (mean u^2 - mean D).

@@ -74,7 +74,7 @@ def _parser() -> cli.Parser:
 
 
 def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
-    """(settings, run to go on with or None)."""
+    """Return (settings, run to go on with or None)."""
     if args.resume:
         run = cli.open_run(args.resume, "--resume")
         if args.max_iterations is not None:
@@ -139,7 +139,7 @@ def _state(parts: Any, run: Any, console: Any) -> tuple[Any, int | None]:
 
 
 def _rounds(parts: Any, state: Any, run: Any, console: Any, resumed_at: int | None) -> Any:
-    """The rounds that are left, watched; the last state."""
+    """Run the remaining rounds, watched; return the last state."""
     from bayessim_mjx import loop
     from bayessim_mjx.monitor.film import film
     from bayessim_mjx.monitor.session import Session
@@ -157,7 +157,7 @@ def _rounds(parts: Any, state: Any, run: Any, console: Any, resumed_at: int | No
 
 
 def _report(console: Any, parts: Any, state: Any) -> None:
-    """The closing table of parameters."""
+    """Print the closing table of parameters."""
     import numpy as np
 
     if parts.settings.modelClass is None:
@@ -175,7 +175,7 @@ def _report(console: Any, parts: Any, state: Any) -> None:
 
 
 def _adapt(argv: Sequence[str] | None) -> int:
-    """The outer loop; exit code 0, 2 (bad input) or 130 (Ctrl-C, after a checkpoint)."""
+    """Run the outer loop; exit code 0, 2 (bad input) or 130 (Ctrl-C, after a checkpoint)."""
     argv = list(sys.argv[1:] if argv is None else argv)
     args = _parser().parse(argv)
     if args.list_tasks:
@@ -203,7 +203,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _named(argv: Sequence[str] | None) -> int:
-    """The command that the first word names, with a hyphen or an underscore."""
+    """Find the command that the first word names, with a hyphen or an underscore."""
     written, *rest = argv or ()
     name = commands.name_of(written)
     if name not in commands.COMMANDS:

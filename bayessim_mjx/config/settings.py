@@ -683,7 +683,7 @@ class Config(Section):
         if b.modelClass is None:
             return
         yield f"bayessim.trainTrajs = {b.trainTrajs}", 4.0 * 10 * b.trainTrajs
-        yield f"bayessim.trainTrajLen = {b.trainTrajLen}", 4.0 * 8 * min(b.trainTrajs, 2500) * b.trainTrajLen
+        yield f"bayessim.trainTrajLen = {b.trainTrajLen}", 4.0 * 8 * min(b.trainTrajs, 4096) * b.trainTrajLen
         yield f"bayessim.hiddenLayers = {list(b.hiddenLayers)}", b.ensemble * _weights(b.hiddenLayers)
         heads = _weights((*b.hiddenLayers[-1:], 3 * b.components))
         kept = 4.0 * 3 * b.components * b.realIters * b.realTrajs

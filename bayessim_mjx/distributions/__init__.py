@@ -12,7 +12,7 @@ __all__ = ["Distribution", "Gaussian", "GaussianMixture", "Uniform"]
 
 
 def Uniform(space: "ParameterSpace", components: int = 1) -> Distribution:  # noqa: N802
-    """The prior over the box (log-uniform or Gaussian where the space says so)."""
+    """Make the prior over the box (log-uniform or Gaussian where the space says so)."""
     return Distribution.prior(space, components)
 
 

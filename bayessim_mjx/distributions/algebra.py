@@ -38,7 +38,7 @@ class Mixture(NamedTuple):
 
 
 def product(a: Mixture, b: Mixture) -> Mixture:
-    """a b / p, closed form: all pairs N(m1, S1) N(m2, S2) / p, and each part of the prior leaves the other factor."""
+    """Compute a b / p: all pairs N(m1, S1) N(m2, S2) / p, and each part of the prior leaves the other factor."""
     a, b = (_conditioned(prune(x, FAINT)) for x in (a, b))
     terms = [_pairs(a, b)]
     if np.isfinite(b.flat):
@@ -50,7 +50,7 @@ def product(a: Mixture, b: Mixture) -> Mixture:
 
 
 def _conditioned(mixture: Mixture) -> Mixture:
-    """The same density in the cube by components whose widths float64 can add.
+    """Express the same density in the cube by components whose widths float64 can add.
 
     In the probit chart a component that is broader than the prior is cut to it: a single data set cannot take knowledge
     away, and the product of many would have no finite mass.

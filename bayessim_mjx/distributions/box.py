@@ -46,7 +46,7 @@ def log_interval(a: Array, b: Array) -> Array:
 
 
 def truncated_normal(a: Array, b: Array, w: Array) -> Array:
-    """Standard normal restricted to [a, b] from uniforms w, by inversion; Marsaglia's tail formula beyond 5 sd."""
+    """Restrict a standard normal to [a, b], from uniforms w by inversion; by Marsaglia's tail formula beyond 5 sd."""
     low, high, flip = _lower_side(a, b)
     pa, pb = ndtr(jnp.stack([low, high]))
     centre = ndtri(jnp.clip(pa + w * (pb - pa), 1e-37, 1.0))
@@ -90,7 +90,7 @@ def forced(means: Array, scales: Array, k: Array, w: Array) -> tuple[Array, Arra
 
 
 def log_bounds(scales: Array) -> Array:
-    """What no point of `forced` weighs more than: scales [K, d, d] -> [K]. Every interval is widest in the middle."""
+    """Bound the weight of each point of `forced`: scales [K, d, d] -> [K]. Every interval is widest in the middle."""
     half = 0.5 / jnp.diagonal(scales, axis1=-2, axis2=-1)
     return jnp.sum(log_interval(-half, half), axis=-1)
 
@@ -106,7 +106,7 @@ def within(mean: np.ndarray, scale: np.ndarray, points: int = 4096) -> tuple[np.
 
 
 def separated(means: np.ndarray, scales: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Standard normals [K, n, d] whose points `separate` keeps in the cube, on a lattice, and log weights [K, n].
+    """Take standard normals [K, n, d] that `separate` keeps in the cube, on a lattice, and their log weights [K, n].
 
     In float64 on the host. Means [K, d], scales [K, d, d]; also far outside.
     """
@@ -151,7 +151,7 @@ def propose(key: Array, logits: Array, means: Array, scales: Array, n: int) -> A
 
 
 def choose(w: Array, logits: Array) -> Array:
-    """Indices with the probabilities softmax(logits [K]) from uniforms w [n] in [0, 1), by inversion -> [n]."""
+    """Draw indices with the probabilities softmax(logits [K]) from uniforms w [n] in [0, 1), by inversion -> [n]."""
     edges = jnp.cumsum(jax.nn.softmax(logits))
     return jnp.sum(w[:, None] * edges[-1] >= edges[None, :-1], axis=1)
 

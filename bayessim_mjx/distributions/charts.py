@@ -23,14 +23,14 @@ SCORE = {"plain": (0.5, 12**-0.5), "probit": (0.0, 1.0), "logit": (0.0, np.pi / 
 
 
 def check(chart: str) -> str:
-    """The chart's name; ValueError if there is none of that name."""
+    """Check the chart's name; ValueError if there is none of that name."""
     if chart not in CHARTS:
         raise ValueError(f"chart = {chart!r}: allowed are {', '.join(CHARTS)}")
     return chart
 
 
 def to_chart(u: Array, chart: str) -> Array:
-    """Unit coordinates -> z, elementwise."""
+    """Map unit coordinates to z, elementwise."""
     if chart == "plain":
         return u
     u = jnp.clip(u, EDGE, 1 - EDGE)

@@ -22,7 +22,7 @@ def empty(components: int, d: int, centre: float = 0.5) -> tuple[np.ndarray, np.
 
 
 def to_mixture(q: Parts) -> algebra.Mixture:
-    """The density of q (plain or probit) as a part of the prior + weighted, untruncated Gaussians.
+    """Write the density of q (plain or probit) as a part of the prior + weighted, untruncated Gaussians.
 
     Components of no weight are left out where they are no Gaussians. ValueError where q is no density.
     """

@@ -58,7 +58,7 @@ class Distribution:
 
     @classmethod
     def prior(cls, space: ParameterSpace, components: int = 1, chart: str = "plain") -> Distribution:
-        """The prior itself, with `components` unused Gaussians so that its structure is a posterior's."""
+        """Make the prior itself, with `components` unused Gaussians so that its structure is a posterior's."""
         _, means, scales = convert.empty(components, len(space), charts.NEUTRAL[charts.check(chart)][0])
         return cls.from_unit(space, np.zeros(components), means, scales, 1.0, chart)
 
@@ -131,11 +131,11 @@ class Distribution:
         return evaluate.moments(self)[1]
 
     def sd(self) -> Array:
-        """Standard deviations in theta units [d], of all draws: a person wants those of `estimates`."""
+        """Compute standard deviations in theta units [d], of all draws: a person wants those of `estimates`."""
         return jnp.sqrt(jnp.diagonal(self.cov()))
 
     def mode(self) -> Array:
-        """The point of highest density in unit coordinates among component means and quadrature points -> theta [d]."""
+        """Find the densest point in unit coordinates, of component means and quadrature points -> theta [d]."""
         return evaluate.mode(self)
 
     def contraction(self) -> Array:
@@ -224,12 +224,12 @@ class Distribution:
         return self._of(self.space, quotient, self.components, self.chart), lost
 
     def reduce(self, components: int) -> Distribution:
-        """The same density with at most `components` Gaussians (negligible ones dropped, then Runnalls merging)."""
+        """Reduce the density to at most `components` Gaussians (negligible ones dropped, then Runnalls merging)."""
         mixture = algebra.reduce(convert.to_mixture(self), components)
         return self._of(self.space, mixture, components, self.chart)
 
     def rechart(self, chart: str) -> Distribution:
-        """The same distribution in another chart; each Gaussian keeps its mean and covariance in the new coordinates.
+        """Express it in another chart; each Gaussian keeps its mean and covariance in the new coordinates.
 
         An approximation, good where components are narrow against the range or the charts alike (logit, probit).
         """
@@ -239,7 +239,7 @@ class Distribution:
         return Distribution.from_unit(self.space, logits, means, scales, self.prior_weight, chart)
 
     def over(self, space: Any) -> Distribution:
-        """The same distribution where ranges have grown to those of `space`, on the host; half the growth wider there.
+        """Extend it to the ranges of `space`, which have grown, on the host; half the growth wider there.
 
         A component that was cut off at an end which has moved goes on beyond it: an extrapolation, to simulate from.
         """
@@ -256,7 +256,7 @@ class Distribution:
         return replace(q, prior_weight=jnp.asarray(w0, jnp.float32))
 
     def split(self) -> list[Distribution]:
-        """The rows of a batched distribution (leaves with one leading axis), as a list."""
+        """List the rows of a batched distribution (leaves with one leading axis)."""
         return [jax.tree.map(lambda leaf, i=i: leaf[i], self) for i in range(self.logits.shape[0])]
 
     # ---- storage ------------------------------------------------------------------------------------------------

@@ -44,7 +44,7 @@ class Estimates:
         return 1.0 - self.width**2
 
     def sentence(self) -> str:
-        """What is kept of the prior, in words; "" where nothing is."""
+        """State in words how much of the prior is kept; "" where nothing is."""
         if self.prior_share >= PRIOR_ITSELF:
             return f"these are numbers of the prior: {percent(self.prior_share)} of the posterior is the prior"
         kept = f"{percent(self.prior_share)} of the prior is kept beside these numbers: no training excludes the truth"

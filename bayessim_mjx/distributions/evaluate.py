@@ -33,14 +33,14 @@ def as_rows(x: Array) -> Array:
 
 
 def to_theta(space: Any, u: Array) -> Array:
-    """Unit coordinates [n, d] -> theta [n, d], kept in the box against float32 rounding."""
+    """Map unit coordinates [n, d] to theta [n, d], kept in the box against float32 rounding."""
     low, high = jnp.asarray(space.low), jnp.asarray(space.high)
     return jnp.clip(rowwise(space.from_unit, u), low[None, :], high[None, :])
 
 
-@jax.jit
-def log_inside(logits: Array, means: Array, scales: Array) -> Array:
-    return jax.nn.logsumexp(jax.nn.log_softmax(logits) + box.log_masses(means, scales))
+@partial(jax.jit, static_argnames="points")
+def log_inside(logits: Array, means: Array, scales: Array, points: int = box.MASS_POINTS) -> Array:
+    return jax.nn.logsumexp(jax.nn.log_softmax(logits) + box.log_masses(means, scales, points))
 
 
 def log_unit(q: Parts, u: Array) -> Array:
@@ -98,7 +98,7 @@ def candidates(q: Parts, key: Array, n: int) -> tuple[Array, Array]:
 
 @partial(jax.jit, static_argnames="points")
 def component_points(q: Parts, points: int) -> tuple[Array, Array]:
-    """Unit coordinates [K, n, d] of each component inside the cube and log weights [K, n]; mean weight = its mass."""
+    """Place points [K, n, d] of each component inside the cube, with log weights [K, n] whose mean is its mass."""
     w = jnp.asarray(box.lattice(points, q.means.shape[-1]))
     if q.chart == "plain":
         return jax.vmap(lambda m, s: box.separate(m, s, w))(q.means, q.scales)

@@ -27,7 +27,7 @@ def write(path: str | Path, arrays: dict[str, np.ndarray], space: Any, chart: st
 
 
 def coordinates(space: Any, chart: str) -> dict[str, Any]:
-    """What arrays in unit coordinates mean: names, box and priors of the space, and the chart; plain, for JSON.
+    """Describe what arrays in unit coordinates mean: names, box and priors of the space, the chart; for JSON.
 
     The box is that which a run begins with. Where ranges have moved, they are arrays beside the others.
     """
@@ -41,7 +41,7 @@ def _box(space: Any) -> dict[str, list[float]]:
 
 
 def disagreement(stored: dict[str, Any], own: dict[str, Any]) -> str:
-    """The first way in which two `coordinates` differ, in words; "" where they do not. Older files lack some."""
+    """Name the first way in which two `coordinates` differ, in words; "" where they do not. Older files lack some."""
     if stored["names"] != own["names"]:
         return f"is over {', '.join(stored['names'])}, but the parameters here are {', '.join(own['names'])}"
     for name, range_ in own["box"].items():

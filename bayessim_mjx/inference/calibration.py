@@ -20,13 +20,12 @@ from scipy.special import ndtr
 from bayessim_mjx.distributions import Distribution, box
 from bayessim_mjx.distributions.evaluate import candidates
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.inference.numbers import ALPHA, DRAWS, FEW
 from bayessim_mjx.inference.temperature import LEVELS, TEMPERATURES, temperature, widened
 from bayessim_mjx.keys import branch
 from bayessim_mjx.quantities import percent, percent_estimate
 
-DRAWS = 256  # proposals per pair, without those outside the box; source: cost alone, ranks in steps of 1/256
-FEWEST = 15  # pairs, at least, that a verdict needs; source: rule of thumb, not counted
-ALPHA = 0.01  # chance of another verdict on a calibrated posterior; source: a chosen level of the tests
+FEWEST = round(1 / (1 - LEVELS[-1]))  # pairs that a verdict needs: one of them lies outside the largest region
 CALIBRATED, OVER, UNDER, BIASED, ODD = "calibrated", "over-confident", "under-confident", "biased", "miscalibrated"
 
 
@@ -42,7 +41,7 @@ class Ranks(NamedTuple):
 
 @partial(jax.jit, static_argnames="draws")
 def ranks(
-    key: Array, posteriors: Distribution, thetas: Array, draws: int = DRAWS, tilt: Distribution | None = None
+    key: Array, posteriors: Distribution, thetas: Array, draws: int = FEW, tilt: Distribution | None = None
 ) -> Ranks:
     """Ranks of thetas [n, d] among up to `draws` of each of n batched posteriors; all pairs in one program.
 
@@ -121,7 +120,7 @@ class Report:
 
 
 def check(
-    key: Array, posteriors: Distribution, thetas: Array, draws: int = DRAWS, tilt: Distribution | None = None
+    key: Array, posteriors: Distribution, thetas: Array, draws: int = FEW, tilt: Distribution | None = None
 ) -> Report:
     """Judge n batched posteriors by the thetas [n, d] that their data were simulated at; theta ~ prior, or `tilt`.
 
@@ -139,7 +138,7 @@ def _usable(found: Ranks) -> Ranks:
 
 
 def judge(found: Ranks, space: Any) -> Report:
-    """The report on given ranks."""
+    """Make the report on given ranks."""
     n, names = len(found.level), tuple(space.names)
     pit = np.asarray(found.parameters, np.float64)
     coverage = {a: (float(np.mean(found.level <= a)), float(np.sqrt(a * (1 - a) / n))) for a in LEVELS}
@@ -197,26 +196,26 @@ def anderson_darling(values: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=8)
-def _null(n: int, draws: int = 4000) -> np.ndarray:
+def _null(n: int, draws: int = DRAWS) -> np.ndarray:
     return anderson_darling(np.random.default_rng(0).random((draws, n)))
 
 
 def corrected(key: Array, posteriors: Distribution, thetas: Array, tilt: Distribution | None = None) -> Report:
     """`check`; where it finds over-confidence, a temperature is fitted on one half and judged on the other."""
-    report = check(key, posteriors, thetas, DRAWS, tilt)
+    report = check(key, posteriors, thetas, tilt=tilt)
     if report.verdict != OVER:
         return report
     n = thetas.shape[0]
     first = np.arange(n) < n // 2
-    if tilt is None:
-        factor = temperature(posteriors, thetas, first)
-    else:
+    if tilt is not None:
         factor = _temperature_by_level(key, posteriors, thetas, first, tilt)
+    else:
+        factor = temperature(posteriors, thetas, first)
     if factor <= 1.0:
         return report
     wider = widened(posteriors, factor)
     # all of them: a program that is compiled already
-    found = jax.tree.map(np.asarray, ranks(branch(key, 1), wider, jnp.asarray(thetas), DRAWS, tilt))
+    found = jax.tree.map(np.asarray, ranks(branch(key, 1), wider, jnp.asarray(thetas), tilt=tilt))
     after = judge(_usable(Ranks(*(part[n // 2 :] for part in found))), posteriors.space.unbatched)
     words = f"{report.words}; standard deviations times {factor:.2f}, then {after.words}"
     return replace(after, words=words, temperature=factor, before=report.verdict)
@@ -225,9 +224,9 @@ def corrected(key: Array, posteriors: Distribution, thetas: Array, tilt: Distrib
 def _temperature_by_level(
     key: Array, posteriors: Distribution, thetas: Array, use: np.ndarray, tilt: Distribution
 ) -> float:
-    """The smallest factor at which the truths lie at HPD levels of 1/2 on average: q tilt / prior has no known norm."""
+    """Find the smallest factor at which the truths have HPD levels of mean 1/2: q tilt / prior has no known norm."""
     for factor in TEMPERATURES:
-        level = np.asarray(ranks(key, widened(posteriors, factor), jnp.asarray(thetas), DRAWS, tilt).level)[use]
+        level = np.asarray(ranks(key, widened(posteriors, factor), jnp.asarray(thetas), tilt=tilt).level)[use]
         if np.nanmean(level) <= 0.5:
             break
     return float(factor)

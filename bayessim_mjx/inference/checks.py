@@ -15,14 +15,13 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import calibration, misspecification
 from bayessim_mjx.inference.calibration import Report
 from bayessim_mjx.inference.fit import condition
-from bayessim_mjx.inference.identify import flat_sentences, restore_prior
+from bayessim_mjx.inference.identify import restore_prior
 from bayessim_mjx.inference.misspecification import Misfit
+from bayessim_mjx.inference.numbers import FEW, NEGLIGIBLE
 from bayessim_mjx.inference.product_calibration import Sets
 from bayessim_mjx.inference.range_ends import Pile, piles
 from bayessim_mjx.inference.temperature import widened
 from bayessim_mjx.quantities import percent, percent_estimate
-
-CANDIDATES = 16  # draws of q for each one of q tilt / prior; source: cost alone
 
 
 @dataclass(frozen=True)
@@ -35,6 +34,11 @@ class Checks:
     flat: tuple[str, ...]  # sentences on parameters that were not identified
     prior_share: float  # of the prior, mixed into the randomisation because of the misfit
     sets: Sets | None = None  # posteriors of several trajectories as they are used, judged on simulated sets
+
+    def guarded(self, posterior: Distribution) -> Distribution:
+        """Mix a further share of the prior into the posterior, because of the misfit."""
+        w, share = posterior.prior_weight, self.prior_share
+        return replace(posterior, prior_weight=jnp.asarray(w + share * (1 - w), jnp.float32)) if share else posterior
 
     @property
     def scalars(self) -> dict[str, float]:
@@ -108,7 +112,7 @@ def examine(
     else:
         report = calibration.check(key, widened(posteriors, temperature), held[0], tilt=tilt)
         report = replace(report, temperature=None if temperature == 1.0 else temperature)
-    misfit = misspecification.detect(network, *simulated, held[1], real, names)
+    misfit = misspecification.detect(network, simulated, held[1], real, names)
     return report, misfit.part(rows)
 
 
@@ -121,16 +125,25 @@ def conditioned(network: Any, x: Array) -> Distribution:
 def conclude(
     report: Report, misfit: Misfit, posterior: Distribution, distrust: float, at_ends: Sequence[Pile] | None = None
 ) -> Checks:
-    """The checks' result for the posterior given all real trajectories; at_ends: its `piles`, as far as known."""
+    """Conclude the checks for the posterior given all real trajectories; at_ends: its `piles`, as far as known."""
     flat = flat_sentences(posterior.names, report.contraction, posterior.estimates().contraction)
-    share = misspecification.prior_share(misfit.joint, distrust)
-    return Checks(report, misfit, tuple(piles(posterior) if at_ends is None else at_ends), tuple(flat), share)
+    found = tuple(piles(posterior) if at_ends is None else at_ends)
+    return Checks(report, misfit, found, tuple(flat), misfit.prior_share(distrust))
 
 
-def guarded(posterior: Distribution, share: float) -> Distribution:
-    """The posterior with a further `share` of the prior mixed in."""
-    w = posterior.prior_weight
-    return replace(posterior, prior_weight=jnp.asarray(w + share * (1 - w), jnp.float32)) if share else posterior
+def flat_sentences(names: Sequence[str], expected: np.ndarray, real: np.ndarray) -> list[str]:
+    """Name the parameters whose posterior is hardly narrower than the prior.
+
+    `expected` [d] is the contraction 1 - var_posterior / var_prior on average over held-out pairs, `real` [d] that of
+    the real trajectories together.
+    """
+    flat = [name for name, a, b in zip(names, expected, real, strict=True) if max(a, b) < NEGLIGIBLE]
+    kind = [name for name, a, b in zip(names, expected, real, strict=True) if b < NEGLIGIBLE <= a]
+    texts = [f"{name}: not identified by these trajectories" for name in flat]
+    return texts + [
+        f"{name}: not identified by the real trajectories, although most simulated ones would identify it"
+        for name in kind
+    ]
 
 
 def replicated(
@@ -149,7 +162,7 @@ def replicated(
     """
     x, keys = x[:pairs], jax.random.split(key, 3)
     posteriors = widened(conditioned(network, x), temperature)
-    many = each if tilt is None else CANDIDATES * each
+    many = each if tilt is None else FEW * each
     draws = jax.vmap(lambda k, q: q.sample(k, many))(jax.random.split(keys[0], x.shape[0]), posteriors)
     if tilt is not None:
         # the highest of log weight + Gumbel noise, `each` times: drawn by weight, without repeats
@@ -160,4 +173,4 @@ def replicated(
     return calibration.predictive(np.asarray(x), np.asarray(again).reshape(x.shape[0], each, -1))[0]
 
 
-__all__ = ["Checks", "conclude", "examine", "guarded", "replicated"]
+__all__ = ["Checks", "conclude", "examine", "flat_sentences", "replicated"]

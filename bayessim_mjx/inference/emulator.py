@@ -8,14 +8,13 @@ import numpy as np
 import optax
 from jax import Array
 
+from bayessim_mjx.inference.numbers import AT_ONCE, TURNS
 from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 
 Layers = list[tuple[Array, Array]]
 # hidden units, gradient steps, rows of a step, learning rate. 5000 steps and twice the weight of the second score flag
 # 95 % of late measurements in place of 94, and fewer wrong noises. source: benchmarks/history.md, misspecification
 WIDTH, STEPS, BATCH, RATE = 128, 1500, 256, 3e-3
-ITERATIONS = 8  # of Levenberg and Marquardt's method; source: rule of thumb, not counted
-AT_ONCE = 1024  # rows explained at once; source: memory alone
 
 
 def emulated(layers: Layers, u: Array) -> Array:
@@ -75,7 +74,7 @@ def explained(layers: Layers, unit: Array, library: Array, guess: Array, y: Arra
             better = _square(left(new)) < _square(e)
             return (jnp.where(better, new, u), jnp.where(better, 0.2, 5.0) * damping), None
 
-        u = jax.lax.scan(iterate, (u, jnp.asarray(1.0)), length=ITERATIONS)[0][0]
+        u = jax.lax.scan(iterate, (u, jnp.asarray(1.0)), length=TURNS)[0][0]
         return u, left(u)
 
     return jax.lax.map(one, (guess, y), batch_size=AT_ONCE)

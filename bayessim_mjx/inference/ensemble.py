@@ -13,23 +13,19 @@ from jax import Array
 
 from bayessim_mjx.distributions import Distribution, charts, evaluate
 from bayessim_mjx.inference import identify, mdn, temperature, truncation_moments
+from bayessim_mjx.inference.numbers import EPS, FEW, NEGLIGIBLE, TURNS
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.inference.state import Data, FitState
 from bayessim_mjx.inference.train import objective_of
 
-SCORED = 256  # validation rows for which the truncated density is reported; source: cost alone
 # sharpnesses of the parts that are tried on held-out rows; before there were several of each member, regions of
 # BayesSimIG's *fixed* held .738 .899 .976. source: benchmarks/history.md, posteriors; the range is a rule of thumb
 SHARPNESS = np.geomspace(0.35, 4.0, 21).astype(np.float32)
-# nats over all held-out rows that another choice of a part has to gain: with a hundred rows the best of many is luck.
-# source: benchmarks/history.md, posteriors
-WORTH = 2.0
-CLIMBS, SWEEPS = 50, 2  # steps towards the parts' weights; rounds of choosing them; source: rule of thumb, not counted
-BEYOND = -1e4  # log mass inside the box: float32 resolves 1e-3 there; source: 24 bits of float32
+BEYOND = -NEGLIGIBLE / EPS  # log mass inside the box: float32 knows what is inside to NEGLIGIBLE of itself
 
 
 def posteriors(state: FitState, z: Array) -> Distribution:
-    """The network's inputs [n, D] -> batched Distribution, a trace of the prior mixed in.
+    """Turn the network's inputs [n, D] into a batched Distribution, a trace of the prior mixed in.
 
     Far from what it was trained on a network may leave the box altogether: what is then inside is the rounding of huge
     numbers, which tells nothing. The prior stays.
@@ -44,19 +40,19 @@ def posteriors(state: FitState, z: Array) -> Distribution:
 def mixtures(state: FitState, z: Array) -> mdn.Heads:
     """Log weights [n, E K], means and factors of the ensemble's mixture."""
     d, settings = len(state.space), state.settings
-    each = jax.vmap(lambda params: mdn.mixture(params, z, d, settings))(parts(state.params))
-    found = joined(each, state.params["share"])
+    own = parts(state.params)
+    found = joined(jax.vmap(lambda params: mdn.mixture(params, z, d, settings))(own), state.params["share"])
     return truncation_moments.weighed(*found)[:3] if settings.coordinates == "matched" else found
 
 
 def parts(params: Any) -> Any:
-    """The networks of the mixture's parts [E, ...]: a member may be several of them, more or less sharp, or none."""
+    """Pick the networks of the mixture's parts [E, ...]: a member may be several, more or less sharp, or none."""
     own = {name: params[name] for name in ("sharpness", "share", "member")}
     return {**jax.tree.map(lambda leaf: leaf[params["member"]], params), **own}
 
 
 def heads(params: Any, data: Data, settings: InferenceSettings) -> mdn.Heads:
-    """Outputs of each member by itself on the held-out rows: leaves [E, V, K, ...].
+    """Compute outputs of each member by itself on the held-out rows: leaves [E, V, K, ...].
 
     All that follows training is computed from it: each forward pass would be compiled once more.
     """
@@ -65,7 +61,7 @@ def heads(params: Any, data: Data, settings: InferenceSettings) -> mdn.Heads:
 
 
 def parts_of(members: mdn.Heads, params: Any) -> mdn.Heads:
-    """The mixture's parts, from what the members make of the same rows: leaves [E, V, K, ...]."""
+    """Pick the mixture's parts from what the members make of the same rows: leaves [E, V, K, ...]."""
     weights, means, factors = (leaf[params["member"]] for leaf in members)
     return weights, means, factors * params["sharpness"].reshape(-1, *[1] * (factors.ndim - 1))
 
@@ -78,7 +74,7 @@ def joined(leaves: mdn.Heads, share: Array) -> mdn.Heads:
 
 
 def weigh(params: Any, data: Data, settings: InferenceSettings, known: mdn.Heads | None = None) -> Any:
-    """The mixture's parts, as many as members: whose network each is, how sharp, its weight; by the held-out density.
+    """Choose the mixture's parts by the held-out density: whose network each is, how sharp, its weight.
 
     Networks that disagree make a mixture that is wider than it need be, a single one is narrower than it may be; and
     where a network is far better in some places than in others, itself sharper and itself wider make the peak and the
@@ -94,7 +90,7 @@ def weigh(params: Any, data: Data, settings: InferenceSettings, known: mdn.Heads
     table = table.reshape(-1, table.shape[-1])
     everyone = jnp.arange(len(table), dtype=jnp.int32)
 
-    def mixed(choice: Array, share: Array, climbs: int) -> tuple[Array, Array]:
+    def mixed(choice: Array, share: Array) -> tuple[Array, Array]:
         """Log weights [E], climbing from `share`, and total log density of the parts `choice` [E]."""
         density = table[choice]
 
@@ -103,26 +99,34 @@ def weigh(params: Any, data: Data, settings: InferenceSettings, known: mdn.Heads
             mine = jax.nn.softmax(density + share[:, None], axis=0) @ data.mask + 1.0
             return jnp.log(mine) - jnp.log(jnp.sum(mine)), None
 
-        share, _ = jax.lax.scan(climb, share, length=climbs)
+        share, _ = jax.lax.scan(climb, share, length=FEW)
         return share, data.mask @ jax.nn.logsumexp(density + share[:, None], axis=0)
 
     def improve(carry: tuple[Array, Array], part: Array) -> tuple[tuple[Array, Array], None]:
-        """The best for one part, the others held."""
+        """Choose the best for one part, the others held."""
         choice, share = carry
         tries = jnp.where(jnp.arange(settings.ensemble) == part, everyone[:, None], choice[None, :])
-        shares, values = jax.vmap(lambda t: mixed(t, share, CLIMBS // 4))(tries)
-        best = jnp.nanargmax(jnp.where(everyone == choice[part], values + WORTH, values))
+        shares, values = jax.vmap(lambda t: mixed(t, share))(tries)
+        # another choice has to gain what it costs to name one of so many: the best of many is luck
+        worth = np.float32(np.log(len(table)))
+        best = jnp.nanargmax(jnp.where(everyone == choice[part], values + worth, values))
         return (tries[best], shares[best]), None
 
     # each member at its best at first
     alone = (table @ data.mask).reshape(len(SHARPNESS), settings.ensemble)
     members = jnp.arange(settings.ensemble, dtype=jnp.int32)
     first = jnp.nanargmax(alone, axis=0).astype(jnp.int32) * settings.ensemble + members
-    turns = jnp.tile(members, SWEEPS)
     alike = jnp.full(settings.ensemble, np.float32(-np.log(settings.ensemble)))
-    (choice, share), _ = jax.lax.scan(improve, (first, mixed(first, alike, CLIMBS)[0]), turns)
+
+    def turn(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        i, before, _, share = carry
+        (choice, share), _ = jax.lax.scan(improve, (before, share), members)
+        return i + 1, choice, jnp.any(choice != before), share
+
+    start = jnp.asarray(0, jnp.int32), first, jnp.asarray(True), mixed(first, alike)[0]
+    _, choice, _, share = jax.lax.while_loop(lambda c: c[2] & (c[0] < TURNS), turn, start)
     sharpness, member = jnp.asarray(SHARPNESS)[choice // settings.ensemble], choice % settings.ensemble
-    return {**params, "sharpness": sharpness, "member": member, "share": mixed(choice, share, CLIMBS)[0]}
+    return {**params, "sharpness": sharpness, "member": member, "share": mixed(choice, share)[0]}
 
 
 def as_deep(state: FitState, data: Data, members: mdn.Heads) -> FitState:
@@ -133,9 +137,9 @@ def as_deep(state: FitState, data: Data, members: mdn.Heads) -> FitState:
     together: a network that is too wide for what it tells may be just right for the others, of which it makes flat
     Gaussians. So it is judged as it is used, with the prior where state.identified has nothing.
     """
-    most, settings, share, keep = temperature.MOST, state.settings, state.params["share"], state.identified
+    settings, share, keep = state.settings, state.params["share"], state.identified
     centre, sd = (np.float32(v) for v in charts.SCORE[settings.chart])
-    own = parts_of(jax.tree.map(lambda leaf: leaf[:, :most], members), state.params)
+    own = parts_of(members, state.params)
     logits, means, scales = joined(mdn.converted(own, settings), share)
     inside, learnt = None, (means, scales)
     if settings.coordinates == "matched":  # masses are long to compute: those of other factors are taken to be the same
@@ -151,7 +155,7 @@ def as_deep(state: FitState, data: Data, members: mdn.Heads) -> FitState:
             return logits, *identify.beside_prior(*before_cut, keep, settings.chart)
         return logits, means, scales / jnp.where(keep, factor, 1.0)[None, None, :, None]
 
-    mask, truth = data.mask[:most], data.y[data.held[:most]] * sd + centre
+    mask, truth = data.mask, data.y[data.held] * sd + centre
     # the same draws in every fit: weights that are kept keep their factor
     factor = temperature.coverage_factor(jax.random.PRNGKey(0), at, truth, mask, keep, settings.chart, inside)
     return replace(state, params={**state.params, "sharpness": state.params["sharpness"] * factor})
@@ -185,14 +189,14 @@ def truncated_scores(
     state: FitState, data: Data, thetas: Array, own: mdn.Heads, mixture: mdn.Heads
 ) -> dict[str, Array]:
     """Scores of the density cut off at the box, from the parts and from their mixture at the held-out rows."""
-    settings, rows, mask = state.settings, data.held[:SCORED], data.mask[:SCORED]
+    settings, rows, mask = state.settings, data.held, data.mask
     truth = jnp.where(mask[:, None] > 0, thetas[rows], jnp.asarray(state.space.nominal)[None, :])
     # as a `Distribution` has it: of the prior, not of a proposal, and cut off afterwards
     plain = settings if settings.coordinates != "truncated" else replace(settings, coordinates="plain")
-    value = held_out(own, state.params["share"], data._replace(proposals=None, origin=None), plain)[:SCORED]
+    value = held_out(own, state.params["share"], data._replace(proposals=None, origin=None), plain)
     inside = jnp.zeros(len(rows))
     if settings.chart == "plain":
-        inside = jax.vmap(evaluate.log_inside)(*(leaf[:SCORED] for leaf in mixture))
+        inside = jax.lax.map(lambda row: evaluate.log_inside(*row, FEW), mixture, batch_size=FEW)
     w0 = settings.defensive
     gain = jnp.log1p(-w0) + value + data.slopes[rows] - inside
     gain = jnp.logaddexp(jnp.log(w0), gain)

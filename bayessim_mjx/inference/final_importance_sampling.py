@@ -14,13 +14,11 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
 from bayessim_mjx.inference.mixture_fit import Mixture
+from bayessim_mjx.inference.numbers import DRAWS, FEW, WIDER
 from bayessim_mjx.inference.smc import ess_of, normalised
 
-DRAWS = 4096  # independent draws; source: the fit limits, not their number (benchmarks/records/posteriors_refined.json)
 # degrees of freedom of Student's t that draws are proposed from: heavier tails; source: rule of thumb, not counted
 FREEDOM = 5.0
-WIDER = 1.2  # factor on the standard deviations of a fitted proposal; source: rule of thumb, not counted
-TRIED = 64  # draws for each that is needed, at most: the others lie beyond the unit cube; source: cost alone
 UNRELIABLE = 0.7  # k above which smoothed weights may be far off; source: Vehtari et al. 2024, section 3.2.4
 
 
@@ -60,7 +58,7 @@ def final_importance_sampling(
         multivariate_t(m, c, df=FREEDOM, allow_singular=True) for m, c in zip(wide.means, wide.covariances, strict=True)
     ]
     inside = np.zeros((0, q.means.shape[1]))
-    for _ in range(TRIED):
+    for _ in range(FEW):  # most draws may lie beyond the unit cube
         part = rng.choice(len(q.weights), DRAWS, p=q.weights / q.weights.sum())
         noise = rng.standard_normal((DRAWS, q.means.shape[1])) * np.sqrt(FREEDOM / rng.chisquare(FREEDOM, (DRAWS, 1)))
         fresh = wide.means[part] + np.einsum("nij,nj->ni", np.linalg.cholesky(wide.covariances)[part], noise)

@@ -22,7 +22,6 @@ from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.inference.state import Again, Data, FitInfo, FitState, prepare, rotated
 from bayessim_mjx.inference.train import MEMBERS, train
 
-LADDER = 1  # power of the members' places that their dropout rises with; source: benchmarks/history.md, graded dropout
 # rows up to which dropout is as set; with more it falls in proportion: the pendulum gains 7.27 -> 7.31 nats,
 # BayesSimIG's *random* 3.72 -> 3.79. source: benchmarks/history.md, posteriors
 FEW = 3000
@@ -30,13 +29,13 @@ FEW = 3000
 
 @lru_cache
 def _program(function: Any, static: tuple[int, ...] = ()) -> Any:
-    """The function compiled at LLVM's first level on the CPU: a tenth less to compile, and no slower."""
+    """Compile the function at LLVM's first level on the CPU: a tenth less to compile, and no slower."""
     level = {"xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else None
     return jax.jit(function, static_argnums=static, compiler_options=level)
 
 
 def _run(function: Any, *given: Any, static: tuple[int, ...] = ()) -> Any:
-    """A whole program, or a part of one that is being traced, which has no options of its own."""
+    """Run a whole program, or a part of one that is being traced, which has no options of its own."""
     inside = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(given))
     return function(*given) if inside else _program(function, static)(*given)
 
@@ -150,9 +149,9 @@ def _fit(
         proposals=proposals, origin=origin, x=jax.vmap(lambda m: rotated(data.x, m, settings.clip))(matrices)
     )
     member = partial(train, data=data, settings=settings, fresh=state.fits == 0)
-    # most members have little dropout
+    # it rises from member to member: most have little
     few = jnp.minimum(1.0, FEW / jnp.maximum(jnp.sum(data.train.astype(jnp.float32)), 1.0))
-    rates = few * settings.dropout * jnp.linspace(0.0, 1.0, settings.ensemble) ** LADDER
+    rates = few * settings.dropout * jnp.linspace(0.0, 1.0, settings.ensemble)
     params, basis, best, steps, skipped, curves = jax.vmap(member, axis_name=MEMBERS)(
         jax.random.split(key, settings.ensemble), {**state.params, "sharpness": jnp.ones(settings.ensemble)}, rates
     )
@@ -177,7 +176,7 @@ def _fit(
 
 
 def _info(state: FitState, data: Data, gain: Array, curves: Array, scores: dict[str, Array]) -> FitInfo:
-    """The scores of a fit, from its curves [E, 2, P] and its mean log density of y."""
+    """Collect the scores of a fit, from its curves [E, 2, P] and its mean log density of y."""
     # densities of y -> densities of u; the same for every weight
     volume = jnp.sum(jnp.where(data.train, data.slopes, 0.0)) / jnp.maximum(jnp.sum(data.train.astype(jnp.float32)), 1)
     held_volume = jnp.sum(data.slopes[data.held] * data.mask) / jnp.sum(data.mask)
@@ -193,7 +192,7 @@ def _info(state: FitState, data: Data, gain: Array, curves: Array, scores: dict[
 
 
 def _bases(state: FitState, data: Data) -> Array:
-    """The matrices [M, D, inputs] that a first fit chooses from; later ones keep its choice.
+    """Make the matrices [M, D, inputs] that a first fit chooses from; later ones keep its choice.
 
     Of features that are standardised anew, regressions are made anew too: what their columns mean stays the same.
     """

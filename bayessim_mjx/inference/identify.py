@@ -7,8 +7,6 @@ marginal posterior beats the prior on held-out simulations.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,14 +14,8 @@ from jax import Array
 from jax.scipy.special import logsumexp
 
 from bayessim_mjx.distributions import Distribution, box, charts
+from bayessim_mjx.inference.numbers import DEFENSIVE, SURE
 from bayessim_mjx.linalg import lower_factor, product
-
-SIGNIFICANT = 3.0  # standard errors of the mean held-out gain: one parameter in 740 by chance; source: normal tail
-RELEVANT = 0.01  # nats of held-out gain that count beyond that; source: rule of thumb, not counted
-# share of the prior mixed in before scoring: a wild row costs 3 nats at most; source: rule of thumb, not counted
-DEFENSIVE = 0.05
-# share of the prior's variance that a narrowed parameter has lost; source: rule of thumb, not counted
-CONTRACTED = 0.05
 
 
 def marginal_gain(logits: Array, means: Array, scales: Array, u: Array) -> Array:
@@ -47,12 +39,12 @@ def identified(gain: Array, mask: Array) -> tuple[Array, Array]:
     gain = jnp.where(mask[:, None] > 0, gain, 0.0)
     mean = jnp.sum(gain, axis=0) / n
     var = jnp.sum(jnp.where(mask[:, None] > 0, (gain - mean[None, :]) ** 2, 0.0), axis=0) / n
-    return mean, mean > SIGNIFICANT * jnp.sqrt(var / n) + RELEVANT
+    return mean, mean > SURE * jnp.sqrt(var / n)
 
 
 @jax.jit
 def restore_prior(posterior: Distribution, keep: Array) -> Distribution:
-    """The posterior over the parameters to keep [d], the prior over the others, independent of them."""
+    """Keep the posterior over the parameters to keep [d] and the prior over the others, independent of them."""
     q, keep = posterior, jnp.asarray(keep)
     means, scales = q.means, q.scales
     if q.chart == "plain":  # the others are cut off at their ranges, which moves what is correlated with them
@@ -76,7 +68,7 @@ def beside_prior(means: Array, scales: Array, keep: Array, chart: str) -> tuple[
 
 
 def _beside_cut(mean: Array, scale: Array, keep: Array) -> tuple[Array, Array]:
-    """A Gaussian over the parameters to keep [d] as it is where the others lie inside the cube: mean, rows of a factor.
+    """Cut a Gaussian in the parameters not to keep [d] at the cube: mean and rows of a factor.
 
     Its moments change by what they change under the cut of the others where its own is made already: a Gaussian's
     own cut is not counted twice. By the separation of variables of Genz (1992), the kept coordinates first.
@@ -105,18 +97,3 @@ def _beside_cut(mean: Array, scale: Array, keep: Array) -> tuple[Array, Array]:
     root = jnp.eye(d) + change / 2 - square / 8 + product(square, change) / 16  # of identity + change, to fourth order
     back = jnp.argsort(order)
     return mean + product(lower, centres[0] - centres[1])[back], product(lower, root)[back]
-
-
-def flat_sentences(names: Sequence[str], expected: np.ndarray, real: np.ndarray) -> list[str]:
-    """Words on parameters whose posterior is hardly narrower than the prior.
-
-    `expected` [d] is the contraction 1 - var_posterior / var_prior on average over held-out pairs, `real` [d] that of
-    the real trajectories together.
-    """
-    flat = [name for name, a, b in zip(names, expected, real, strict=True) if max(a, b) < CONTRACTED]
-    kind = [name for name, a, b in zip(names, expected, real, strict=True) if b < CONTRACTED <= a]
-    texts = [f"{name}: not identified by these trajectories" for name in flat]
-    return texts + [
-        f"{name}: not identified by the real trajectories, although most simulated ones would identify it"
-        for name in kind
-    ]

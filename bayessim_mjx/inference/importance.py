@@ -22,16 +22,44 @@ from scipy.stats import multivariate_t
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.distributions.charts import EDGE, to_chart
 from bayessim_mjx.inference import smc
-from bayessim_mjx.inference.final_importance_sampling import FREEDOM, WIDER, final_importance_sampling
+from bayessim_mjx.inference.final_importance_sampling import FREEDOM, final_importance_sampling
 from bayessim_mjx.inference.mixture_fit import Mixture, fitted, fitted_to_islands, in_cube
+from bayessim_mjx.inference.numbers import AT_ONCE, DEFENSIVE, NEGLIGIBLE, WIDER
+from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.inference.smc import KEPT, ParticleState, normalised, powered, tempering
 
 LogLikelihood = Callable[[np.ndarray], np.ndarray]  # theta [N, d] -> [N]; not finite: impossible
 
-# share of draws from the prior, whatever was learnt; source: rule of thumb, method of Hesterberg 1995
-DEFENSIVE = 0.1
 ROUNDS, MOVES = 4, 96  # of importance sampling and of moves after it, at most; source: cost alone
-ENOUGH = 150.0  # independent draws that a posterior needs, of the worst parameter; source: rule of thumb, not counted
+ENOUGH = 0.5 / NEGLIGIBLE**2  # independent draws, of the worst parameter: its sd is known to NEGLIGIBLE of itself
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A posterior to find.
+
+    Attributes:
+        proposal: where the posterior may be, e.g. the product of a network's posteriors; it may be too narrow or off.
+        log_likelihood: of all data, for thetas [draws, d] at once.
+        components: at most so many Gaussians in the posterior.
+        draws: thetas of one call; every call has as many, so one compiled program serves all. A multiple of ISLANDS.
+        rounds: of importance sampling, at most.
+    """
+
+    proposal: Distribution
+    log_likelihood: LogLikelihood
+    components: int = InferenceSettings.components
+    draws: int = AT_ONCE
+    rounds: int = ROUNDS
+
+    @property
+    def chart(self) -> str:
+        """Coordinates in which the answer is a mixture of Gaussians."""
+        return "plain" if self.proposal.chart == "plain" else "probit"
+
+    def of_unit(self, u: np.ndarray) -> np.ndarray:
+        """Compute the log likelihood [N] at u [N, d] in the unit cube."""
+        return np.asarray(self.log_likelihood(thetas(self.proposal.space, u)), np.float64)
 
 
 @dataclass(frozen=True)
@@ -68,146 +96,114 @@ class Refined:
 class _Draws:
     """All that was simulated: z [N, d] in probit coordinates, log likelihood and log prior density less that drawn."""
 
-    space: Any
+    problem: Problem
     used: list[Mixture]
     z: np.ndarray
     like: np.ndarray
     base: np.ndarray
 
-    def more(self, rng: np.random.Generator, log_likelihood: LogLikelihood, count: int) -> None:
-        """`count` draws of the last mixture."""
-        fresh = _draw(rng, self.used[-1], count)
-        found = np.asarray(log_likelihood(thetas(self.space, ndtr(fresh))), np.float64)
+    def more(self, rng: np.random.Generator) -> None:
+        """Add a call's draws of the last mixture."""
+        fresh = _draw(rng, self.used[-1], self.problem.draws)
+        found = self.problem.of_unit(ndtr(fresh))
         self.z = np.concatenate([self.z, fresh])
         self.like = np.concatenate([self.like, np.where(np.isfinite(found), found, -np.inf)])
         self.base = _log_prior(self.z) - _mixed(self.used, self.z)
 
 
-def refine(
-    proposal: Distribution,
-    log_likelihood: LogLikelihood,
-    *,
-    seed: int = 0,
-    draws: int = 1024,
-    rounds: int = ROUNDS,
-    moves: int = MOVES,
-    components: int = 8,
-    enough: float = ENOUGH,
-    also: tuple[np.ndarray, np.ndarray] | None = None,
-) -> Refined:
-    """The posterior prior x likelihood, found from `proposal`.
+def refine(problem: Problem, seed: int = 0, also: tuple[np.ndarray, np.ndarray] | None = None) -> Refined:
+    """Find the posterior prior x likelihood from the proposal.
 
     Args:
-        proposal: where the posterior may be, e.g. the product of a network's posteriors; it may be too narrow or off.
-        log_likelihood: of all data, for thetas [draws, d] at once.
+        problem: what is looked for.
         seed: of the draws.
-        draws: thetas of one call; every call has as many, so one compiled program serves all. A multiple of ISLANDS.
-        rounds: of importance sampling, at most.
-        moves: of all draws after that, at most.
-        components: at most so many Gaussians in the posterior.
-        enough: independent draws to end with.
         also: mean [d] and covariance [d, d] of z (theta in the probit chart) where the posterior may be too: half of
             the first draws are from there.
 
     Returns:
         The refined posterior, or the proposal with the reason why it was kept.
     """
-    space, rng = proposal.space, np.random.default_rng(seed)
-    near = _near(rng, proposal, log_likelihood, draws, rounds, also)
+    rng, proposal = np.random.default_rng(seed), problem.proposal
+    near = _near(rng, problem, also)
     if not np.isfinite(near.like).any():
         reason = f"none of {len(near.z)} simulations has a finite likelihood"
         return Refined(proposal, proposal, None, 0.0, len(near.z), np.asarray(proposal.mode()), reason)
-    start = smc.init(rng, ndtr(near.z), near.like, near.base, draws)
-    found = smc.run(rng, lambda u: log_likelihood(thetas(space, u)), start, enough, moves)
-    return _answer(rng, proposal, found, components, enough, len(near.z))
+    start = smc.init(rng, ndtr(near.z), near.like, near.base, problem.draws)
+    found = smc.run(rng, problem.of_unit, start, ENOUGH, MOVES)
+    return _answer(rng, problem, found, len(near.z))
 
 
-def tempered(
-    found: Refined, proposal: Distribution, log_likelihood: LogLikelihood, power: float,
-    *, moves: int = MOVES // 2, components: int = 8, enough: float = ENOUGH, seed: int = 0,
-) -> Refined:  # fmt: skip
-    """The same with the likelihood to a power, a generalised posterior (Bissiri et al. 2016)."""
+def tempered(problem: Problem, found: Refined, power: float, seed: int = 0) -> Refined:
+    """Refine with the likelihood to a power: a generalised posterior (Bissiri et al. 2016)."""
     assert found.population is not None
-    rng, space = np.random.default_rng(seed), proposal.space
-    at = smc.run(rng, lambda u: log_likelihood(thetas(space, u)), found.population, enough, moves, power)
-    return _answer(rng, proposal, at, components, enough, found.simulations - found.population.simulations, power)
+    rng = np.random.default_rng(seed)
+    at = smc.run(rng, problem.of_unit, found.population, ENOUGH, MOVES // 2, power)
+    return _answer(rng, problem, at, found.simulations - found.population.simulations, power)
 
 
-def sharpened(
-    found: Refined, proposal: Distribution, log_likelihood: LogLikelihood,
-    *, draws: int = 1024, components: int = 8, power: float = 1.0, seed: int = 0,
-) -> Refined:  # fmt: skip
-    """`found` with Gaussians fitted to independent draws, where the effective sample size of these is larger.
+def sharpened(problem: Problem, found: Refined, power: float = 1.0, seed: int = 0) -> Refined:
+    """Fit Gaussians to independent draws, where the effective sample size of these is larger.
 
     Args:
+        problem: as `refine` took it.
         found: as `refine` (power 1) or `tempered` left it.
-        proposal, log_likelihood, draws, components: as in `refine`.
         power: of the likelihood.
         seed: of the draws.
     """
     if found.reason or found.population is None:
         return found
-    rng, space = np.random.default_rng(seed), proposal.space
-    q = fitted_to_islands(rng, found.population.islands, components)
-    drawn = final_importance_sampling(
-        rng, q, lambda u: power * np.asarray(log_likelihood(thetas(space, u)), np.float64), draws
-    )
+    rng = np.random.default_rng(seed)
+    q = fitted_to_islands(rng, found.population.islands, problem.components)
+    drawn = final_importance_sampling(rng, q, lambda u: power * problem.of_unit(u), problem.draws)
     if drawn is None or drawn.ess <= found.effective:
         return found
     u, weights, count = drawn.u, drawn.weights, drawn.ess
-    chart = "plain" if proposal.chart == "plain" else "probit"
-    z = np.asarray(to_chart(jnp.asarray(u), chart), np.float64)
-    fit = _mixture(space, chart, lambda own: fitted(rng, z[:, own], weights, components), z, count, weights)
+    z = np.asarray(to_chart(jnp.asarray(u), problem.chart), np.float64)
+    fit = _mixture(problem, lambda own: fitted(rng, z[:, own], weights, problem.components), z, count, weights)
     simulations = found.simulations + len(u)
     return replace(found, posterior=fit, fitted=fit, effective=count, simulations=simulations, shape=drawn.shape)
 
 
-def _near(
-    rng: np.random.Generator, proposal: Distribution, log_likelihood: LogLikelihood, draws: int, rounds: int,
-    also: tuple[np.ndarray, np.ndarray] | None,
-) -> _Draws:  # fmt: skip
-    """Draws by importance sampling, of which half of one call's number count if `rounds` are enough."""
-    d = len(proposal.space)
-    first = _begin(proposal) if also is None else _joined(_begin(proposal), *also)
-    near = _Draws(proposal.space, [first], np.zeros((0, d)), np.zeros(0), np.zeros(0))
-    for turn in range(rounds):
-        near.more(rng, log_likelihood, draws)
+def _near(rng: np.random.Generator, problem: Problem, also: tuple[np.ndarray, np.ndarray] | None) -> _Draws:
+    """Draw by importance sampling, until half of one call's number count or `problem.rounds` are over."""
+    d, draws = len(problem.proposal.space), problem.draws
+    first = _begin(problem.proposal) if also is None else _joined(_begin(problem.proposal), *also)
+    near = _Draws(problem, [first], np.zeros((0, d)), np.zeros(0), np.zeros(0))
+    for turn in range(problem.rounds):
+        near.more(rng)
         if not np.isfinite(near.like).any():
             continue
         power = tempering(near.base, near.like, KEPT * draws)
-        if power == 1.0 or turn == rounds - 1:
+        if power == 1.0 or turn == problem.rounds - 1:
             break
         weights = normalised(powered(near.base, near.like, power))
         near.used.append(_wider(fitted(rng, near.z, weights, 2)))
     return near
 
 
-def _answer(
-    rng: np.random.Generator, proposal: Distribution, at: ParticleState, components: int, enough: float, before: int,
-    power: float = 1.0,
-) -> Refined:  # fmt: skip
-    """The result of the particles, if their islands agree."""
-    chart = "plain" if proposal.chart == "plain" else "probit"
-    draws = np.asarray(to_chart(jnp.asarray(at.islands), chart), np.float64)
+def _answer(rng: np.random.Generator, problem: Problem, at: ParticleState, before: int, power: float = 1.0) -> Refined:
+    """Make the result of the particles, if their islands agree."""
+    draws = np.asarray(to_chart(jnp.asarray(at.islands), problem.chart), np.float64)
     every, count = draws.reshape(-1, draws.shape[-1]), max(at.ess, 1.0)
-    fit = _mixture(proposal.space, chart, lambda own: fitted_to_islands(rng, draws[..., own], components), every, count)
-    simulations, missing = before + at.simulations, at.missing(enough, power)
+    fit = _mixture(problem, lambda own: fitted_to_islands(rng, draws[..., own], problem.components), every, count)
+    simulations, missing = before + at.simulations, at.missing(ENOUGH, power)
     reason = missing and f"{missing}, after {simulations} simulations"
-    best = thetas(proposal.space, at.u[np.argmax(at.like)][None])[0]
-    return Refined(proposal if reason else fit, fit, at, at.ess, simulations, best, reason)
+    best = thetas(problem.proposal.space, at.u[np.argmax(at.like)][None])[0]
+    return Refined(problem.proposal if reason else fit, fit, at, at.ess, simulations, best, reason)
 
 
 def _mixture(
-    space: Any, chart: str, fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, count: float,
+    problem: Problem, fit: Callable[[np.ndarray], Mixture], draws: np.ndarray, count: float,
     weights: np.ndarray | None = None,
 ) -> Distribution:  # fmt: skip
     """Gaussians that `fit` finds in the coordinates (`[d]`, bool) it is asked for, in the chart of draws [N, d]."""
+    space, chart = problem.proposal.space, problem.chart
     q = in_cube(fit, draws, count, weights) if chart == "plain" else fit(np.ones(draws.shape[1], bool))
     return Distribution.from_unit(space, np.log(q.weights), q.means, np.linalg.cholesky(q.covariances), chart=chart)
 
 
 def _begin(proposal: Distribution) -> Mixture:
-    """The proposal's Gaussians in z, and the prior."""
+    """Take the proposal's Gaussians in z, and the prior."""
     q = proposal.rechart("probit")
     logits = np.asarray(q.logits, np.float64)
     weights = np.exp(logits - logsumexp(logits))
@@ -274,4 +270,4 @@ def thetas(space: Any, u: np.ndarray) -> np.ndarray:
     return np.asarray(space.from_unit(jnp.asarray(np.clip(u, EDGE, 1 - EDGE), jnp.float32)))
 
 
-__all__ = ["Refined", "refine", "sharpened", "tempered", "thetas"]
+__all__ = ["Problem", "Refined", "refine", "sharpened", "tempered", "thetas"]

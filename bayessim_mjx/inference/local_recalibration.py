@@ -15,23 +15,14 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import f
+from scipy.stats import chi2, f
 
 from bayessim_mjx.distributions import Distribution, box
 from bayessim_mjx.distributions.charts import EDGE, to_chart
-from bayessim_mjx.inference.product_calibration import Count, Sets, counted, moved, multiplied, stacked
-from bayessim_mjx.inference.temperature import FEW
+from bayessim_mjx.inference.numbers import ALPHA, FEW, TURNS
+from bayessim_mjx.inference.product_calibration import FACTORS, Count, Sets, counted, moved, multiplied, stacked
 
-# times that sets are drawn from the posterior, at most; 1.9 to 3.9 are used. source:
-# benchmarks/records/posteriors_corners.json
-TURNS = 6
-SAME = 1.05  # factor between widenings that counts as none; source: half a step of product_calibration.FACTORS
-# squared change of a move that counts as none, in standard deviations of the errors, beyond the part of chance: half a
-# standard deviation. source: docs/decisions/local_recalibration.md
-STILL = 0.25
-CHANCE = 0.01  # of a move where products are off by chance alone; source: a chosen level of Hotelling's test
-LEAST = 1.5, 8  # sets that Hotelling's test needs: 1.5 a parameter and 8; source: rule of thumb, not counted
-FOLDS = 8  # of the sets: each is judged with the move of the other seven eighths; source: rule of thumb, not counted
+SAME = float((FACTORS[1] / FACTORS[0]) ** 0.5)  # factor between widenings that counts as none: half a step
 # error that a product counts as off by, at most, in its chart; source: rule of thumb, not counted
 FAR = {"plain": 1.0, "probit": 4.0}
 
@@ -58,9 +49,9 @@ def recalibrated(found: Sets, product: Distribution, drawn: Drawn, components: i
         simulated = drawn(found.used(product, n), turn)
         if simulated is None:
             break
-        one, move, step = judged(*simulated, components, before)
+        one, move, still = judged(*simulated, components, before)
         found = replace(found, near=(*found.near, one), move=move)
-        if step < STILL and found.widening(n) <= widening * SAME:
+        if still and found.widening(n) <= widening * SAME:
             break
     else:
         return replace(found, settled=False)
@@ -69,24 +60,24 @@ def recalibrated(found: Sets, product: Distribution, drawn: Drawn, components: i
 
 def judged(
     factors: Factors, thetas: np.ndarray, components: int, before: np.ndarray | None
-) -> tuple[Count, np.ndarray | None, float]:
-    """Products of all factors of each set, moved and widened as they ask for: how they did, the move [d], its change.
+) -> tuple[Count, np.ndarray | None, bool]:
+    """Judge products of all factors of each set, moved and widened as they ask for.
 
-    How they did is with the moves that the other sets ask for: a move that the same sets have chosen fits their chance.
-    The change, against the move `before`, is squared, in standard deviations of the errors, less what chance makes of
-    it where both are means of as many errors.
+    Returns:
+        The results, each with the move that the other sets ask for: a move that the same sets have chosen fits their
+        chance. The move [d]. Whether it differs from the move `before` by no more than chance makes of two means of as
+        many errors.
     """
     products = stacked(multiplied(factors, components, [len(factors[0])])[0])
     off = np.asarray(_errors(products, jnp.asarray(thetas, jnp.float32)), float)
     off = np.clip(off, -FAR[products.chart], FAR[products.chart])
     move, cov = mean_error(off)
-    fold = np.arange(len(off)) % FOLDS
-    moves = [mean_error(off[fold != k])[0] for k in range(FOLDS)]
+    moves = [mean_error(np.delete(off, k, axis=0))[0] for k in range(len(off))]
     move = None if all(each is None for each in moves) else move  # as none of them is judged with one
     change = (0.0 if move is None else move) - (0.0 if before is None else before) + np.zeros(off.shape[1])
-    step = float(change @ np.linalg.solve(cov, change)) - 2 * len(change) / len(off)
-    apart = stacked([moved(q, moves[k]) for q, k in zip(products.split(), fold, strict=True)])
-    return counted(len(factors[0]), apart, thetas), move, step
+    squared = float(change @ np.linalg.solve(cov, change)) * len(off) / 2
+    apart = stacked([moved(q, own) for q, own in zip(products.split(), moves, strict=True)])
+    return counted(len(factors[0]), apart, thetas), move, squared < chi2.isf(ALPHA, len(change))
 
 
 def count(
@@ -110,11 +101,11 @@ def mean_error(off: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
     m, d = off.shape
     mean = off.mean(0)
     cov = np.atleast_2d(np.cov(off.T)) + 1e-12 * np.eye(d)
-    if m < LEAST[0] * d + LEAST[1]:
+    if m <= d:
         return None, cov
     statistic = m * float(mean @ np.linalg.solve(cov, mean))
     chance = d * (m - 1) / (m - d)
-    if statistic < chance * f.ppf(1 - CHANCE, d, m - d):
+    if statistic < chance * f.isf(ALPHA, d, m - d):
         return None, cov
     return mean * (1 - chance / statistic), cov
 

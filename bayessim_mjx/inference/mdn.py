@@ -19,23 +19,21 @@ from jax import Array
 from bayessim_mjx.distributions import Distribution, box, charts
 from bayessim_mjx.inference import densities
 from bayessim_mjx.inference.densities import Drop, Params
+from bayessim_mjx.inference.numbers import AT_ONCE, DEFENSIVE, FEW
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 
 Heads = tuple[Array, Array, Array]  # log weights [n, K], centres [n, K, d], factors A [n, K, d, d]
 
-UNUSED = -60.0  # log weight of components that a member does not use; source: below float32's resolution
-CUT_POINTS = 16  # quasi-Monte-Carlo points of a component's mass inside the box, in training; source: cost alone
-AT_ONCE = 1024  # trajectories embedded at once; source: memory alone
-# log mass inside the box that training uses at least; source: rule of thumb, not counted
-LEAST_INSIDE = float(np.log(0.1))
+UNUSED = float(np.log(np.finfo(np.float32).tiny))  # log weight of components that a member does not use
+LEAST_INSIDE = float(np.log(DEFENSIVE))  # log mass inside the box that training uses at least
 # of the parameters, those that are not trained by gradients; the last three belong to the parts of the mixture
 FIXED = ("used", "sharpness", "share", "member")
 LOG_2PI = float(np.log(2 * np.pi))
 
 
 def to_y(u: Array, chart: str = "plain") -> Array:
-    """Unit coordinates -> coordinates of the network."""
+    """Map unit coordinates to coordinates of the network."""
     centre, sd = charts.SCORE[chart]
     return (charts.to_chart(u, chart) - np.float32(centre)) * np.float32(1 / sd)
 
@@ -57,7 +55,7 @@ def fixed(settings: InferenceSettings) -> tuple[str, ...]:
 
 
 def head_size(d: int, settings: InferenceSettings) -> int:
-    """Outputs of the network: logits, centres, log diagonals, strictly lower entries."""
+    """Count the outputs of the network: logits, centres, log diagonals, strictly lower entries."""
     lower = d * (d - 1) // 2 if settings.fullCovariance else 0
     return settings.components * (1 + 2 * d + lower)
 
@@ -111,7 +109,7 @@ def embedded(params: Params, x: Array, settings: InferenceSettings) -> Array:
 
 
 def hidden(params: Params, x: Array, settings: InferenceSettings, drop: Drop | None = None) -> Array:
-    """Inputs of the last layer: the density's hidden units (some dropped in training) or features, [n, F] -> [n, H]."""
+    """Compute the last layer's inputs: the density's hidden units (some dropped in training), [n, F] -> [n, H]."""
     return densities.density_of(settings).hidden(params, x, drop)
 
 
@@ -169,7 +167,7 @@ def log_inside(heads: Heads) -> Array:
     n, k, d = means.shape
     centre, sd = (np.float32(v) for v in charts.SCORE["plain"])
     flat = lambda v: v.reshape(n * k, *v.shape[2:])  # noqa: E731
-    points = 1 if d == 1 else CUT_POINTS
+    points = 1 if d == 1 else FEW
     mass = box.log_masses(flat(means * sd + centre), flat(inverse_lower(factors) * sd), points)
     # a floor: mixtures that are all but outside must not gain by how coarsely so little is estimated
     return jnp.maximum(jax.nn.logsumexp(weights + mass.reshape(n, k), axis=-1), LEAST_INSIDE)

@@ -20,18 +20,14 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.inference import emulator, mdn
-from bayessim_mjx.linalg import inverse_spread, product
+from bayessim_mjx.inference.numbers import DRAWS
+from bayessim_mjx.inference.settings import InferenceSettings
+from bayessim_mjx.linalg import REGRESSED, RIDGE, inverse_spread, product
 
-# Random features of theta-hat behind E[z | theta-hat], their length scale in units of the box, the ridge in units of
-# their variance. source: faults flagged with them, benchmarks/records/misspecified.json; single values not
-# counted
-FOURIER = 300
-WIDTH = 0.4  # their length scale, in units of the box; source: as FOURIER
-RIDGE = 1e-4  # of the features' variance; source: as FOURIER
-MOST_ALONE = 1024  # features up to which each is predicted from all others; source: cost alone
-MOST = 256  # whitened coordinates; a longer summary's residual is projected at random; source: cost alone
-NEIGHBOURS, NEAR = 5, 4000  # nearest simulations, among so many; source: rule of thumb, not counted
-CLIP = 20.0  # standard deviations; source: rule of thumb, not counted
+# random features of theta-hat behind E[z | theta-hat]; as many whitened coordinates: a longer summary's residual is
+# projected at random
+FOURIER = InferenceSettings.fourierFeatures
+WIDTH = 6**-0.5  # their length scale in units of the box: the root mean square distance of two draws of the prior
 # p-value below which the posterior is distrusted: 6.0 % (2.8 to 8.0) of sound trajectories are.
 # source: benchmarks/records/misspecified.json
 FLAGGED = 0.05
@@ -66,13 +62,17 @@ class Misfit:
     def flagged(self) -> bool:
         return self.joint < FLAGGED
 
+    def prior_share(self, most: float) -> float:
+        """Share of the prior in the randomisation: 0 where nothing is flagged, rising to `most` at p = 0."""
+        return most * max(0.0, 1.0 - self.joint / FLAGGED)
+
     def part(self, rows: slice) -> Misfit:
-        """The result of some of the trajectories."""
+        """Select the result of some of the trajectories."""
         found = {name: getattr(self, name)[rows] for name in ("p", "parts", "sides", "features", "residuals")}
         return replace(self, **found)
 
     def sentence(self) -> str:
-        """A sentence for a person; empty where nothing is wrong."""
+        """Write a sentence for a person; empty where nothing is wrong."""
         if not self.flagged:
             return ""
         worst = int(np.argmin(self.p))
@@ -87,15 +87,10 @@ class Misfit:
         return f"something moves them that no parameter explains, or the noise is larger (most in {self.worst(row)})"
 
     def worst(self, row: int) -> str:
-        """The feature of one trajectory that is least like simulated ones, by its name."""
+        """Name the feature of one trajectory that is least like simulated ones."""
         # several may lie beyond all simulations: then the farthest
         feature = int(np.lexsort((-np.abs(self.residuals[row]), self.features[row]))[0])
         return self.names[feature] if self.names else f"feature {feature}"
-
-
-def prior_share(p: float, most: float) -> float:
-    """Share of the prior in the randomisation: 0 where p >= 0.05, rising to `most` at p = 0."""
-    return most * max(0.0, 1.0 - p / FLAGGED)
 
 
 def combined(p: np.ndarray) -> float:
@@ -105,14 +100,14 @@ def combined(p: np.ndarray) -> float:
 
 
 def detect(
-    state: Any, thetas: Array, x: Array, count: int | Array, held: Array, real: Array, names: Sequence[str] = ()
+    state: Any, simulated: tuple[Array, Array, int | Array], held: Array, real: Array, names: Sequence[str] = ()
 ) -> Misfit:
     """Test real summaries [n, D] against fresh simulations `held` [m, D] that the network has not seen.
 
-    `thetas` [N, d] and `x` [N, D] are what the network of `state` was fitted on, `count` of their rows valid. `names`
-    [D] say what the features are.
+    `simulated` is what the network of `state` was fitted on: thetas [N, d], x [N, D] and how many of their rows are
+    valid. `names` [D] say what the features are.
     """
-    rows = jnp.concatenate([jnp.asarray(held), jnp.asarray(real)])
+    rows, (thetas, x, count) = jnp.concatenate([jnp.asarray(held), jnp.asarray(real)]), simulated
     scores = jax.tree.map(np.asarray, score(state, thetas, x, jnp.asarray(count, jnp.int32), rows))
     m = held.shape[0]
     usable = np.all(np.isfinite(scores.joint[:m]), axis=1) & np.all(np.isfinite(scores.features[:m]), axis=1)
@@ -143,7 +138,7 @@ def _joint(held: np.ndarray, row: np.ndarray) -> tuple[float, np.ndarray, np.nda
 
 
 def _count_below(pool: np.ndarray) -> np.ndarray:
-    """Number of smaller values in each column, [n, k]."""
+    """Count the smaller values in each column, [n, k]."""
     return np.stack([np.searchsorted(np.sort(column), column, side="left") for column in pool.T], axis=1)
 
 
@@ -156,7 +151,7 @@ def _two_sided(held: np.ndarray, real: np.ndarray) -> np.ndarray:
 
 
 def latent(state: Any, x: Array) -> Array:
-    """The network's features of summaries x [n, D]: the last hidden layers of all members of the ensemble, [n, E H]."""
+    """Compute the network's features of summaries x [n, D]: the last hidden layers of all members, [n, E H]."""
     z = state.inputs(x)
     layers = jax.vmap(lambda params: mdn.hidden(params, mdn.embedded(params, z, state.settings), state.settings))(
         state.params
@@ -182,7 +177,7 @@ def score(state: Any, thetas: Array, x: Array, count: Array, rows: Array) -> Sco
     turn, weight = _signal(product(emulator.emulated(params, u), unit), used)
     unit = product(unit, turn)
     estimate = _ridge(jnp.concatenate([h, z, ones[0]], 1), u, used)
-    first = lambda v: v[:NEAR]  # noqa: E731
+    first = lambda v: v[:DRAWS]  # noqa: E731
     (best, w), (best_new, w_new) = (
         emulator.explained(params, unit, first(u), jnp.clip(product(jnp.concatenate([*rows], 1), estimate), 0, 1), goal)
         for rows, goal in (((first(h), first(z), first(ones[0])), first(y)), ((h_new, z_new, ones[1]), y_new))
@@ -191,7 +186,7 @@ def score(state: Any, thetas: Array, x: Array, count: Array, rows: Array) -> Sco
     # log w^2 given theta: noise and the reach of the emulator differ over the box
     spread = _ridge(f, jnp.log(w * w + 1e-3), first(used))
     scaled = w_new / jnp.exp(0.5 * product(f_new, spread))
-    near = _nearest(h[:NEAR], used[:NEAR], h_new)
+    near = _nearest(first(h), first(used), h_new)
     smooth = jnp.log(jnp.sum(weight[None, :] * scaled**2, 1))
     joint = jnp.stack([jnp.log(jnp.sum(scaled**2, 1)), smooth, near], axis=1)
     return Scores(joint, _alone(z, f, used, z_new, f_new))
@@ -213,9 +208,9 @@ def _alone(z: Array, f: Array, used: Array, z_new: Array, f_new: Array) -> Array
     """Distance of each feature from its prediction by all others, in standard deviations -> [n, D].
 
     One odd feature spoils theta-hat and with it the residuals of features that are as they should be; so those are
-    taken only where there are too many features to invert their covariance. f [NEAR, F] are functions of theta-hat.
+    taken only where there are too many features to invert their covariance. f [DRAWS, F] are functions of theta-hat.
     """
-    if z.shape[1] > MOST_ALONE:
+    if z.shape[1] > REGRESSED:
         z, used = z[: f.shape[0]], used[: f.shape[0]]
         mean = _ridge(f, z, used)
         r, r_new = z - product(f, mean), z_new - product(f_new, mean)
@@ -235,7 +230,9 @@ def _standardised(x: Array, used: Array, *arrays: Array) -> list[Array]:
     mean = _mean(x, used)
     sd = jnp.sqrt(_mean((x - mean[None, :]) ** 2, used))
     rate = inverse_spread(mean, sd)
-    return [jnp.clip((a - mean[None, :]) * rate[None, :], -CLIP, CLIP) for a in arrays]
+    return [
+        jnp.clip((a - mean[None, :]) * rate[None, :], -InferenceSettings.clip, InferenceSettings.clip) for a in arrays
+    ]
 
 
 def _ridge(f: Array, y: Array, used: Array) -> Array:
@@ -255,11 +252,11 @@ def _fourier(u: Array) -> Array:
 
 
 def _whitener(r: Array, used: Array) -> Array:
-    """Matrix [D, m] after which the used residuals have covariance 1; m <= MOST."""
+    """Matrix [D, m] after which the used residuals have covariance 1; m <= FOURIER."""
     size = r.shape[1]
     projection = jnp.eye(size)
-    if size > MOST:
-        projection = jnp.asarray(np.random.default_rng(1).normal(size=(size, MOST)) / np.sqrt(size), jnp.float32)
+    if size > FOURIER:
+        projection = jnp.asarray(np.random.default_rng(1).normal(size=(size, FOURIER)) / np.sqrt(size), jnp.float32)
     p = product(r, projection) * used[:, None]
     cov = product(p.T, p) / jnp.maximum(jnp.sum(used), 1.0)
     values, vectors = jnp.linalg.eigh(cov)
@@ -269,8 +266,7 @@ def _whitener(r: Array, used: Array) -> Array:
 
 
 def _nearest(h: Array, used: Array, new: Array) -> Array:
-    """log mean distance of new [n, H] to the nearest used rows of h [N, H]."""
+    """Log distance of new [n, H] to the nearest used row of h [N, H]."""
     square = jnp.sum(new**2, 1)[:, None] + jnp.sum(h**2, 1)[None, :] - 2 * product(new, h.T)
     square = jnp.where(used[None, :] > 0, jnp.maximum(square, 1e-9), jnp.inf)
-    nearest = -jax.lax.top_k(-square, min(NEIGHBOURS, h.shape[0]))[0]
-    return jnp.log(jnp.mean(jnp.sqrt(nearest), axis=1))
+    return 0.5 * jnp.log(jnp.min(square, axis=1))

@@ -10,17 +10,11 @@ from scipy.linalg import eigh
 from scipy.special import logsumexp
 
 from bayessim_mjx.distributions import box
+from bayessim_mjx.inference.numbers import DRAWS, FEW, NEGLIGIBLE, SURE
 from bayessim_mjx.inference.smc import ess_of
 
-DRAWS = 4096  # at most, that are fitted to; source: cost alone, others were not measured
-FLAT = 1.5  # sd, in widths of the cube: the density falls by 5 % over the cube; source: exp(-0.5^2 / (2 FLAT^2))
-# standard errors beyond which draws are not uniform by chance: .98 of uniform directions pass, and a direction that
-# passes wrongly loses less than its moments' chance would. source: benchmarks/records/flat_directions.json
-SURE = 3.0
-# draws in each direction, behind every Gaussian: fewer than one span a plane and have no Gaussian; where that does not
-# happen 0 to 6 make no difference. source: benchmarks/inference/few_draws.py
-FEWEST = 3
-STRIDE = 1.5  # power of a ratio of variances: the cut part changes by less than its Gaussian; source: speed alone
+# sd, in widths of the cube, of a density that falls by NEGLIGIBLE from the middle to an end: exp(-0.5^2 / (2 FLAT^2))
+FLAT = float((-8 * np.log(1 - NEGLIGIBLE)) ** -0.5)
 
 
 @dataclass(frozen=True)
@@ -70,24 +64,29 @@ def fitted_to_islands(rng: np.random.Generator, islands: np.ndarray, most: int) 
 
 
 def supported(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: int) -> Mixture:
-    """`em` with k Gaussians, or half as many and so on where one would stand on fewer than FEWEST draws a direction.
+    """`em` with k Gaussians, or half as many and so on where one would stand on fewer draws than it has numbers.
 
     A few draws of much weight span a plane, and a Gaussian fitted to them is a spike beside everything else.
     """
     q = em(rng, z, weights, k)
     share = q.shares(z) * weights[:, None]
     fewest = min(ess_of(own / own.sum()) if own.sum() > 0 else 0.0 for own in share.T)
-    return q if k == 1 or fewest >= FEWEST * z.shape[1] else supported(rng, z, weights, k // 2)
+    return q if k == 1 or fewest >= numbers_of(z.shape[1]) else supported(rng, z, weights, k // 2)
+
+
+def numbers_of(d: int) -> int:
+    """Count the numbers of a Gaussian over d coordinates: fewer draws span a plane, or say nothing of some of them."""
+    return d * (d + 3) // 2
 
 
 def _count(rng: np.random.Generator, halves: list[tuple[np.ndarray, np.ndarray]], most: int) -> int:
-    """Number of Gaussians that, fitted to one half (draws [N, d], weights [N]), explain the other half best."""
+    """Count the Gaussians that, fitted to one half (draws [N, d], weights [N]), explain the other half best."""
     best, score = 1, -np.inf
     for k in (k for k in (1, 2, 4, 8, 16, 32) if k <= most):
         held = 0.0
         for (z, weights), (others, theirs) in (halves, halves[::-1]):
             own = weights / weights.sum()
-            if ess_of(own) < FEWEST * z.shape[1] * k:
+            if ess_of(own) < numbers_of(z.shape[1]) * k:
                 held = -np.inf
                 break
             held += float(theirs @ em(rng, z, own, k).log_density(others))
@@ -128,7 +127,7 @@ def _moments(draws: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def match_truncated_moments(
-    q: Mixture, draws: np.ndarray, ess: float, weights: np.ndarray | None = None, steps: int = 20
+    q: Mixture, draws: np.ndarray, ess: float, weights: np.ndarray | None = None, steps: int = FEW
 ) -> Mixture:
     """Gaussians that have the draws' moments once they are cut off at the unit cube (Lee and Scott 2012).
 
@@ -178,15 +177,15 @@ def _matched(
 
 
 def _towards(covariance: np.ndarray, wanted: np.ndarray, cut: np.ndarray) -> np.ndarray:
-    """The covariance [d, d] changed so that, cut off, it comes nearer to `wanted` than it was, which is `cut`."""
+    """Change the covariance [d, d] so that, cut off, it comes nearer to `wanted` than it was, which is `cut`."""
     ratio, axes = eigh(wanted, cut)  # axes.T @ cut @ axes = I
     back = np.linalg.inv(axes)
-    by = back.T * np.clip(ratio, 0.5, 2.0) ** (0.5 * STRIDE) @ axes.T
+    by = back.T * np.clip(ratio, 0.5, 2.0) ** 0.5 @ axes.T
     return by @ covariance @ by.T
 
 
-def em(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: int, steps: int = 60) -> Mixture:
-    """Expectation maximisation on weighted draws, begun at k-means++ centres; variances are at least 1e-3 of all."""
+def em(rng: np.random.Generator, z: np.ndarray, weights: np.ndarray, k: int, steps: int = FEW) -> Mixture:
+    """Fit weighted draws by expectation maximisation from k-means++ centres; variances are at least 1e-3 of all."""
     mean, whole = _moments(z, weights)
     # a few draws span a plane only: densities need every direction, well above rounding
     whole += np.diag(1e-8 * np.diag(whole) + 1e-20)

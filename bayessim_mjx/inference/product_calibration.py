@@ -17,16 +17,12 @@ import numpy as np
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference.fit import combine
+from bayessim_mjx.inference.numbers import DOUBT, ROUNDED, SURE
 from bayessim_mjx.inference.temperature import LEVELS, gain_at, tempered
 
 # factors on standard deviations, tried: 64 sets do not show less than a step, 8.6 %. source: docs/inference.md, several
 # trajectories
 FACTORS = np.geomspace(1.0, 12.0, 31)
-# sd of the factor's log beforehand: a few sets are off by chance (9486466). source: rule of thumb, not counted
-DOUBT = 0.3
-BEYOND = -30.0  # change of log mass in the box that no move may reach: rounding alone remains; source: float32
-SURE = 2.58  # standard errors that chance exceeds once in a hundred times; source: normal distribution, two-sided
-HALVES = 2  # the factor is fitted on one part of the sets and judged on the other, in turn; source: the least
 
 
 @dataclass(frozen=True)
@@ -82,7 +78,7 @@ class Sets:
         return best.trajectories
 
     def at(self, trajectories: int) -> Count:
-        """The row of so many trajectories, or of the next smaller number that was judged."""
+        """Find the row of so many trajectories, or of the next smaller number that was judged."""
         return max((c for c in self.counts if c.trajectories <= trajectories), key=lambda c: c.trajectories)
 
     def widening(self, trajectories: int) -> float:
@@ -99,7 +95,7 @@ class Sets:
         return float(np.sqrt(1 + (max(judged, float(FACTORS[1])) ** 2 - 1) * more))
 
     def used(self, product: Distribution, trajectories: int) -> Distribution:
-        """The posterior of so many trajectories as it is used, of their product: moved and widened."""
+        """Move and widen a product of so many trajectories' posteriors, as it is used."""
         last = self.counts[-1].trajectories
         here = moved(product, self.move) if self.at(trajectories).trajectories == last else product
         return tempered(here, self.widening(trajectories))
@@ -212,7 +208,7 @@ def moved(q: Distribution, move: np.ndarray | None) -> Distribution:
     if move is None:
         return q
     there = Distribution.from_unit(q.space, q.logits, q.means + jnp.asarray(move), q.scales, q.prior_weight, q.chart)
-    return there if float(there.log_inside - q.log_inside) > BEYOND else q
+    return there if float(there.log_inside - q.log_inside) > ROUNDED else q
 
 
 def stacked(items: Sequence[Distribution]) -> Distribution:
@@ -243,9 +239,9 @@ def counted(n: int, products: Distribution, thetas: np.ndarray, given: float | N
     """Results of batched products of n at thetas [m, d], widened by `given` or the best factor of the other half."""
     at = jnp.asarray(thetas, jnp.float32)
     gains = np.nan_to_num(np.asarray(_gains(products, at), float), nan=-100.0, neginf=-100.0)
-    part = np.arange(len(thetas)) % HALVES
+    part = np.arange(len(thetas)) % 2
     if given is None:
-        chosen = np.array([_best(gains[:, part != p]) for p in range(HALVES)])[part]
+        chosen = np.array([_best(gains[:, part != p]) for p in (0, 1)])[part]
         best = _best(gains)
     else:
         best = int(np.argmin(np.abs(FACTORS - given)))

@@ -15,14 +15,13 @@ import jax
 import numpy as np
 
 from bayessim_mjx.distributions import Distribution
+from bayessim_mjx.inference.numbers import NEGLIGIBLE
 from bayessim_mjx.parameters.ranged import Ranged
 from bayessim_mjx.quantities import percent
 
-OUTER = 0.05  # of the range, in unit coordinates: mass of the prior that lies there; source: rule of thumb, not counted
-PILED = 0.25  # mass of the posterior there, five times that of the prior; source: rule of thumb, not counted
-# of a limit above 0: it comes ten times nearer to 0 in a round at most; source: rule of thumb, not counted
-STEEPEST = 0.1
-LEAST = 0.05  # of a range's width: a smaller move counts as none; source: rule of thumb, not counted
+# mass of the posterior in the outer NEGLIGIBLE of a range, five times that of the prior; source: rule of thumb, not
+# counted
+PILED = 0.25
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Pile:
 
 
 def piles(posterior: Distribution) -> list[Pile]:
-    """Ends at which more than a quarter of the posterior lies, densest at the end itself; parameters in order."""
+    """List the ends with more than a quarter of the posterior, densest at the end itself; parameters in order."""
     theta, weights = posterior.quadrature()
     u = np.asarray(jax.vmap(posterior.space.to_unit)(theta), np.float64)
     w = np.asarray(weights, np.float64)
@@ -67,7 +66,7 @@ def piles(posterior: Distribution) -> list[Pile]:
     for i, name in enumerate(posterior.names):
         for upper in (False, True):
             away = 1 - u[:, i] if upper else u[:, i]
-            outer, next_ = w[away <= OUTER].sum(), w[(away > OUTER) & (away <= 2 * OUTER)].sum()
+            outer, next_ = w[away <= NEGLIGIBLE].sum(), w[(away > NEGLIGIBLE) & (away <= 2 * NEGLIGIBLE)].sum()
             if outer > PILED and outer > next_:
                 limit = (posterior.space.high if upper else posterior.space.low)[i]
                 found.append(Pile(name, upper, float(outer), float(limit)))
@@ -75,7 +74,7 @@ def piles(posterior: Distribution) -> list[Pile]:
 
 
 def moved(space: Ranged, found: Sequence[Pile], lowest: np.ndarray, highest: np.ndarray) -> tuple[Ranged, list[Pile]]:
-    """The space of the next round, and the piles as they moved: each end by the width of its range, as far as it may.
+    """Move each end by the width of its range, as far as it may; return the next round's space and the piles.
 
     Widths of a log-uniform prior are those of the logarithm. Physics ends at lowest, highest [d].
     """
@@ -87,7 +86,7 @@ def moved(space: Ranged, found: Sequence[Pile], lowest: np.ndarray, highest: np.
         grown = np.clip(_grown(pile.upper, low[i], high[i], log), lowest[i], highest[i])
         scale = np.log if log else np.asarray
         way = (scale(grown) - scale(pile.limit)) * (1 if pile.upper else -1)
-        far = way >= LEAST * (scale(high[i]) - scale(low[i]))
+        far = way >= NEGLIGIBLE * (scale(high[i]) - scale(low[i]))
         new.append(replace(pile, moved=float(np.float32(grown)) if far else pile.limit))
     for pile in new:
         assert pile.moved is not None
@@ -96,17 +95,12 @@ def moved(space: Ranged, found: Sequence[Pile], lowest: np.ndarray, highest: np.
 
 
 def _grown(upper: bool, low: float, high: float, log: bool) -> float:
-    if log:
-        return high * high / low if upper else low * low / high
+    """Move an end by the width of its range; a limit above 0 stays above it, as under a log-uniform prior."""
     if upper:
-        return high + (high - low)
-    return max(low - (high - low), STEEPEST * low) if low > 0 else low - (high - low)
+        return high * high / low if log else high + (high - low)
+    if log:
+        return low * low / high
+    return max(2 * low - high, low * low / high) if low > 0 else 2 * low - high
 
 
-def share(before: Ranged, after: Ranged) -> float:
-    """Mass of the prior over the range after a move that lies in the range before."""
-    start, end = (np.asarray(after.to_unit(x), np.float64) for x in (before.low, before.high))
-    return float(np.prod(end - start))
-
-
-__all__ = ["Pile", "moved", "piles", "share"]
+__all__ = ["Pile", "moved", "piles"]

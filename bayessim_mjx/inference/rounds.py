@@ -21,15 +21,12 @@ from jax import Array
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.distributions.estimates import PRIOR_ITSELF as REGION  # from there on `truncated` keeps no region
 from bayessim_mjx.inference.fit import FitInfo, FitState, fit, infer, init
+from bayessim_mjx.inference.numbers import DEFENSIVE, DRAWS
 from bayessim_mjx.inference.settings import InferenceSettings
 
 METHODS = ("apt", "truncated", "division")
-GAUSSIANS = 8  # of a proposal of apt; source: rule of thumb, not counted
-# of the prior in a proposal of apt: a wrong first round hides nothing for ever; source: rule of thumb, not counted
-SHARE = 0.05
 # of the posterior that `truncated` leaves outside; source: rule of thumb, method of Deistler et al. 2022
 MASS = 1e-3
-POOL = 4096  # draws tried at once by `truncated`, four of them beyond its level; source: cost alone, not measured
 
 
 def chart_of(chart: str) -> str:
@@ -39,16 +36,16 @@ def chart_of(chart: str) -> str:
 
 def size_of(proposal: str, components: int) -> int:
     """Gaussians of a proposal."""
-    return {"apt": GAUSSIANS, "division": 1}.get(proposal, components)
+    return 1 if proposal == "division" else components
 
 
 def first(space: object, proposal: str, components: int, chart: str) -> Distribution:
-    """The prior, with the structure of later proposals."""
+    """Make the prior, with the structure of later proposals."""
     return Distribution.prior(space, size_of(proposal, components), chart_of(chart))  # type: ignore[arg-type]
 
 
 def following(posterior: Distribution, proposal: str) -> Distribution:
-    """The proposal of the next round, given the posterior of this one."""
+    """Make the proposal of the next round, given the posterior of this one."""
     if proposal == "truncated":
         # the share of the prior, mixed in against misjudgement, would make all of the box the region
         w = posterior.prior_weight
@@ -65,34 +62,26 @@ def draw(key: Array, proposal: Distribution, method: str, n: int) -> Array:
     return proposal.sample(key, n)
 
 
-def divided(factors: list[Distribution], proposal: Distribution) -> tuple[list[Distribution], float]:
-    """Each factor times prior / proposal, and the mean share of weight whose quotient is no density."""
-    if float(proposal.prior_weight) >= REGION:  # the prior itself
-        return factors, 0.0
-    found = [factor.divide(proposal) for factor in factors]
-    return [q for q, _ in found], float(np.mean([lost for _, lost in found])) if found else 0.0
-
-
 def stored(proposals: Distribution, row: int, new: Distribution) -> Distribution:
     """Batched proposals with one of them replaced."""
     return jax.tree.map(lambda all_, one: all_.at[row].set(one), proposals, new)
 
 
 def repeated(proposal: Distribution, rows: int) -> Distribution:
-    """A batch of the same proposal."""
+    """Make a batch of the same proposal."""
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (rows, *leaf.shape)), proposal)
 
 
 def proposal_of(posterior: Distribution, method: str) -> Distribution:
-    """The proposal of the next round (for `truncated`: drawn by draw_truncated)."""
+    """Make the proposal of the next round (for `truncated`: drawn by draw_truncated)."""
     if method not in METHODS:
         raise ValueError(f"method = {method!r}: there are {', '.join(METHODS)}")
     if method == "division":
         return replace(posterior.reduce(1), prior_weight=jnp.zeros((), jnp.float32))
     if method == "truncated":
         return posterior
-    wide = posterior.reduce(GAUSSIANS)
-    return replace(wide, prior_weight=jnp.maximum(wide.prior_weight, SHARE))
+    # of the prior, so that a wrong first round hides nothing for ever
+    return replace(posterior, prior_weight=jnp.maximum(posterior.prior_weight, DEFENSIVE))
 
 
 def stack(proposals: Sequence[Distribution]) -> Distribution:
@@ -115,18 +104,18 @@ def draw_truncated(key: Array, posterior: Distribution, n: int, mass: float = MA
     The volume is a share of the prior. By rejection from half prior, half posterior of doubled spread.
     """
     key, key_level = jax.random.split(key)
-    level = jnp.quantile(posterior.log_gain(posterior.sample(key_level, POOL)), mass)
+    level = jnp.quantile(posterior.log_gain(posterior.sample(key_level, DRAWS)), mass)
     q = posterior
     wide = Distribution.from_unit(q.space, q.logits, q.means, 2 * q.scales, 0.5, q.chart)
     kept: list[np.ndarray] = []
     weights: list[np.ndarray] = []
     while sum(len(rows) for rows in kept) < n:
         key, key_draw, key_keep = jax.random.split(key, 3)
-        theta = wide.sample(key_draw, POOL)
+        theta = wide.sample(key_draw, DRAWS)
         # prior / wide density, at most 2
         weight = np.asarray(jnp.where(posterior.log_gain(theta) >= level, jnp.exp(-wide.log_gain(theta)), 0.0))
         weights.append(weight)
-        chosen = np.asarray(jax.random.uniform(key_keep, (POOL,))) * max(w.max() for w in weights) < weight
+        chosen = np.asarray(jax.random.uniform(key_keep, (DRAWS,))) * max(w.max() for w in weights) < weight
         kept.append(np.asarray(theta)[chosen])
     return jnp.asarray(np.concatenate(kept)[:n]), float(np.mean(weights))
 

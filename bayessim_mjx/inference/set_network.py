@@ -25,19 +25,12 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.distributions.charts import EDGE, from_chart, to_chart
 from bayessim_mjx.inference import ensemble
 from bayessim_mjx.inference.fit import FitInfo, FitState, condition, fit, init
+from bayessim_mjx.inference.numbers import AT_ONCE, DRAWS, EPS, FEW
+from bayessim_mjx.inference.whitening import LIMIT
 from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
-LONGEST = 512  # features of a summary up to which they are pooled too; source: a choice, others were not measured
-AT_ONCE = 1024  # trajectories embedded at once; source: memory alone
-
 Simulate = Callable[[Array, Array], Array]  # key, theta [m, d] -> summaries [m, D]
-MASS = 1e-3  # of a Gaussian that an ellipsoid leaves outside before it is widened; source: as `rounds.MASS`
-# standard deviations, times: with the posterior itself as region, its ends would look like knowledge.
-# source: a choice, others were not measured
-WIDER = 2.0
-POOL = 4096  # draws behind its mean and covariance, known to 1/64 of an sd; source: cost alone
-STEPS = 32  # of a walk, times the number of parameters; source: a choice, others were not measured
 
 
 @dataclass(frozen=True)
@@ -75,7 +68,7 @@ def _posteriors(space: ParameterSpace, logits: Array, means: Array, scales: Arra
 def learn(
     key: Array, network: FitState, near: Distribution, simulate: Simulate, trajectories: int, sets: int
 ) -> SetNetwork:
-    """A network of sets of so many trajectories.
+    """Learn a network of sets of so many trajectories.
 
     Args:
         key: consumed.
@@ -108,7 +101,7 @@ class _Pool(NamedTuple):
 def pooled(network: FitState, columns: Iterable[Array]) -> Array:
     """Features [m, F] of m sets, given as n columns of summaries [m, D]; whatever the order of the columns.
 
-    They are the mean of the standardised summaries (where these have no more than LONGEST features), and of the
+    They are the mean of the standardised summaries (where these have no more than LIMIT features), and of the
     product of the Gaussians that have the moments of each posterior the mean [d] and the log precisions [d].
     """
     each = [_pool(network, x) for x in columns]
@@ -116,7 +109,7 @@ def pooled(network: FitState, columns: Iterable[Array]) -> Array:
     back = inverse_lower(total.lower)
     centre = product(jnp.swapaxes(back, -1, -2), product(back, total.pull[..., None]))[..., 0]
     parts = [centre, jnp.log(jnp.diagonal(total.lower, axis1=-2, axis2=-1))]
-    if total.summaries.shape[1] <= LONGEST:
+    if total.summaries.shape[1] <= LIMIT:
         parts.append(total.summaries / len(each))
     return jnp.concatenate(parts, axis=1)
 
@@ -133,7 +126,7 @@ def _pool(network: FitState, x: Array) -> _Pool:
 
 
 def _embedded(network: FitState, x: Array) -> _Pool:
-    """The Gaussian with the moments of the posterior of one summary [D], in the chart of the network."""
+    """Find the Gaussian with the moments of the posterior of one summary [D], in the chart of the network."""
     z = network.inputs(x[None])
     logits, means, scales = (leaf[0] for leaf in ensemble.mixtures(network, z))
     root = jnp.sqrt(jax.nn.softmax(logits))
@@ -144,7 +137,7 @@ def _embedded(network: FitState, x: Array) -> _Pool:
     return _Pool(half.T @ (half @ mean), lower_factor(half.T), z[0])
 
 
-def draw_region(key: Array, near: Distribution, count: int, wider: float = WIDER) -> tuple[Array, Array, Array]:
+def draw_region(key: Array, near: Distribution, count: int) -> tuple[Array, Array, Array]:
     """Draws of the prior within the ellipsoid of the chart's coordinates mean + scale y, |y| < 1.
 
     By hit-and-run from draws of `near` (Smith 1984): along a random direction anywhere within the ellipsoid and the
@@ -154,19 +147,19 @@ def draw_region(key: Array, near: Distribution, count: int, wider: float = WIDER
         key: consumed.
         near: a posterior in plain or probit coordinates; its share of the prior is left out.
         count: of draws.
-        wider: factor on its standard deviations.
 
     Returns:
         y [count, d], mean [d], scale [d, d] lower triangular.
     """
-    radius = wider * float(np.sqrt(chi2.ppf(1 - MASS, len(near.names))))
+    # all of a Gaussian but rounding: ends of a narrower region would look like knowledge
+    radius = float(np.sqrt(chi2.isf(EPS, len(near.names))))
     return _draw_region(key, replace(near, prior_weight=jnp.zeros_like(near.prior_weight)), radius, count)
 
 
 @partial(jax.jit, static_argnames="count")
 def _draw_region(key: Array, near: Distribution, radius: Array, count: int) -> tuple[Array, Array, Array]:
     k_pool, k_walk = jax.random.split(key)
-    theta = near.sample(k_pool, max(POOL, count))
+    theta = near.sample(k_pool, max(DRAWS, count))
     z = to_chart(jnp.clip(jax.vmap(near.space.to_unit)(theta), EDGE, 1 - EDGE), near.chart)
     mean, d = jnp.mean(z, axis=0), z.shape[1]
     away = z - mean[None, :]
@@ -189,7 +182,7 @@ def _draw_region(key: Array, near: Distribution, radius: Array, count: int) -> t
         by = middle + ndtri(jnp.clip(a + far * (b - a), 1e-7, 1 - 1e-7)) / size
         return y + jnp.clip(by, low, high)[:, None] * way, None
 
-    y, _ = jax.lax.scan(step, y, jax.random.split(k_walk, STEPS * d))
+    y, _ = jax.lax.scan(step, y, jax.random.split(k_walk, FEW * d))
     return y, mean, scale
 
 

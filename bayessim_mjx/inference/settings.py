@@ -13,7 +13,7 @@ from bayessim_mjx.errors import UserError
 
 
 def _of_run(name: str) -> Any:
-    """The setting `bayessim.<name>`: its default, meaning and limits stand there alone."""
+    """Copy the setting `bayessim.<name>`: its default, meaning and limits stand there alone."""
     given = BayesSimConfig.__dataclass_fields__[name]
     return field(default=given.default, metadata=given.metadata)
 
@@ -88,7 +88,7 @@ class InferenceSettings(Section):
         return "plain" if self.coordinates in ("matched", "truncated", "auto") else self.coordinates
 
     def at(self, space: Any) -> InferenceSettings:
-        """These settings with the coordinates that suit the priors of `space`, where they are `auto`."""
+        """Return the settings with the coordinates that suit the priors of `space`, where they are `auto`."""
         if self.coordinates != "auto":
             return self
         gaussian = len(space) > 0 and all(p.prior == "gaussian" for p in space.parameters)

@@ -17,17 +17,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
+from scipy.stats import t
+
+from bayessim_mjx.inference.numbers import ALPHA, DEFENSIVE, WIDER
 
 ISLANDS = 8  # populations that never exchange draws; source: rule of thumb, not counted
-SWEEPS = 3  # of moves at a power below the last; source: rule of thumb, not counted
 SPREAD = 2.38  # the best step for Gaussians is this / sqrt(2 d) differences; source: Roberts and Rosenthal 2001
-JUMPS = 0.1  # share of steps that are a whole difference, from mode to mode; source: ter Braak 2006, every tenth step
-# factor on the standard deviations of the others when a part is drawn anew; source: rule of thumb, not counted
-WIDER = 1.1
-# share of the parameters that one step changes; source: rule of thumb, method of Laloy and Vrugt 2012
-PARTS = (0.25, 0.5, 1.0)
-FORGOTTEN = 0.3  # correlation with the start draws that may remain; source: rule of thumb, not counted
-STILL = 5.0  # t over 8 islands of the rise of the log likelihood: .2 % of still ones exceed it; source: Student's t
+STILL = float(t.isf(ALPHA / 2, ISLANDS - 1))  # Student's t over the islands of a rise of the log likelihood
 # effective share of the draws at the next power; source: rule of thumb, method of Beskos et al. 2016
 KEPT = 0.5
 
@@ -89,12 +85,12 @@ class ParticleState:
         return float(rise.mean() / max(rise.std(ddof=1) / ISLANDS**0.5, 1e-30))
 
     def missing(self, enough: float, to: float = 1.0) -> str | None:
-        """The reason why these draws do not count as `enough` independent ones at the power `to`; None: they do."""
+        """Say why these draws do not count as `enough` independent ones at the power `to`; None: they do."""
         if self.power != to:
             return f"the likelihood can be followed to its power {self.power:.2g} only"
         if not self.ess >= enough:
             return f"the draws are worth {self.ess:.0f} independent ones, {enough:.0f} are needed"
-        if self.memory > FORGOTTEN:
+        if self.memory > KEPT:
             return f"draws still depend on where they began, correlation {self.memory:.2f}"
         return "the draws' likelihood still changes" if abs(self.trend) > STILL else None
 
@@ -129,13 +125,13 @@ def run(
     while at.power != to and left > 0:
         at = _reweighted(rng, at, to)
         if at.power != to:
-            for _ in range(SWEEPS):
+            for _ in KERNELS:
                 at, left = _swept(rng, log_likelihood, at, at.u), left - 1
     passed: list[ParticleState] = []
     others = at.u
     at = replace(at, origin=at.u)
     while left > 0:
-        if passed and len(passed) % SWEEPS == 0:
+        if passed and len(passed) % len(KERNELS) == 0:
             kept = passed[-(-len(passed) // 2) :]  # the first half forgets where it began
             at = replace(at, kept=np.stack([x.u for x in kept]), likes=np.stack([x.like for x in kept]))
             if at.missing(enough, to) is None:
@@ -165,10 +161,9 @@ def _swept(
 ) -> ParticleState:
     """One Metropolis step of every draw; `others` [M, d], which do not change meanwhile, tell how far and where to."""
     count, d = at.u.shape
-    part = rng.random((count, d)) < rng.choice(PARTS, count)[:, None]
+    part = rng.random((count, d)) < rng.random((count, 1))  # any share of them is as likely
     part[np.arange(count), rng.integers(d, size=count)] = True
-    propose = _redrawn if at.calls % 2 else _stepped
-    fresh, bias = propose(rng, at.u, others, part)
+    fresh, bias = KERNELS[at.calls % len(KERNELS)](rng, at.u, others, part)
     inside = np.all((fresh >= 0) & (fresh <= 1), axis=1)
     like = np.asarray(log_likelihood(np.where(inside[:, None], fresh, at.u)), np.float64)
     like = np.where(inside & np.isfinite(like), like, -np.inf)
@@ -187,7 +182,7 @@ def _stepped(
     one, two = rng.integers(len(others), size=(2, count))
     # a tenth of the best step to all of it, for valleys that bend; rule of thumb, not counted
     size = SPREAD / np.sqrt(2 * part.sum(1)) * 10 ** rng.uniform(-1, 0, count)
-    size = np.where(rng.random(count) < JUMPS, 1.0, size)[:, None]
+    size = np.where(rng.random(count) < DEFENSIVE, 1.0, size)[:, None]
     step = (
         size * (others[one] - others[two]) + 1e-3 * rng.standard_normal((count, d)) @ np.linalg.cholesky(_cov(others)).T
     )
@@ -215,6 +210,9 @@ def _redrawn(
     return fresh, 0.5 * (squared(fresh) - squared(u))
 
 
+KERNELS = (_stepped, _redrawn)  # in turn; at a power below the last, each once
+
+
 def _cov(draws: np.ndarray) -> np.ndarray:
     """Covariance [d, d] of draws [M, d], regular also where they span a plane only."""
     d = draws.shape[1]
@@ -235,7 +233,7 @@ def powered(base: np.ndarray, like: np.ndarray, power: float) -> np.ndarray:
 
 
 def tempering(base: np.ndarray, like: np.ndarray, wanted: float, most: float = 1.0) -> float:
-    """The largest power of the likelihood, at most `most`, at which `wanted` draws count."""
+    """Find the largest power of the likelihood, at most `most`, at which `wanted` draws count."""
     held = np.where(np.isfinite(like), like, -1e300)
     if ess_of(normalised(base + most * held)) >= wanted:
         return most
@@ -247,7 +245,7 @@ def tempering(base: np.ndarray, like: np.ndarray, wanted: float, most: float = 1
 
 
 def _systematic(rng: np.random.Generator, weights: np.ndarray, count: int) -> np.ndarray:
-    """Indices [count], each as often as its weight says, to less than one."""
+    """Draw indices [count], each as often as its weight says, to less than one."""
     return np.minimum(np.searchsorted(np.cumsum(weights), (rng.random() + np.arange(count)) / count), len(weights) - 1)
 
 

@@ -14,12 +14,10 @@ from jax import Array
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.distributions.storage import coordinates
 from bayessim_mjx.inference import mdn
+from bayessim_mjx.inference.numbers import DRAWS, FEW
 from bayessim_mjx.inference.settings import InferenceSettings
-from bayessim_mjx.inference.temperature import TOGETHER
 from bayessim_mjx.keys import GOLDEN
 from bayessim_mjx.linalg import inverse_spread, product
-
-MOST = 4096  # held-out rows; source: memory alone
 
 
 @struct.dataclass
@@ -119,7 +117,7 @@ def prepare(
     held = valid & (rows.astype(jnp.uint32) * GOLDEN < share)  # spread evenly over any number of rows
     held = jnp.where(jnp.any(held), held, valid)  # a handful of rows: better to validate on them than not at all
     # a multiple of what is looked at together: a remainder would be another program of the same
-    room = min(x.shape[0], -(-(int(state.settings.validation * x.shape[0]) + 8) // TOGETHER) * TOGETHER, MOST)
+    room = min(x.shape[0], -(-(int(state.settings.validation * x.shape[0]) + 8) // FEW) * FEW, DRAWS)
     order = jnp.argsort(~held)[:room]
     train = jnp.where(jnp.any(valid & ~held), valid & ~held, valid)
     y = mdn.to_y(u, state.settings.chart)

@@ -30,7 +30,7 @@ __all__ = [
 
 
 def get(name: str, **options: Any) -> Summarizer:
-    """The summarizer of that name, options bound.
+    """Find the summarizer of that name, options bound.
 
     `summary_` may be left out, and a number at the end is its option: start_<steps>, waypts_<waypoints>, corr_<lags>,
     corrdiff_<lags>, signatory_<depth>, logsignature_<depth>.
@@ -41,7 +41,7 @@ def get(name: str, **options: Any) -> Summarizer:
 
 
 def size(summarizer: Summarizer, steps: int, state_size: int, action_size: int) -> int:
-    """Number of features for trajectories of `steps` actions; UserError where there are too many or too few steps."""
+    """Count the features for trajectories of `steps` actions; UserError where there are too many or too few steps."""
     states = jax.ShapeDtypeStruct((steps + 1, state_size), jnp.float32)
     actions = jax.ShapeDtypeStruct((steps, action_size), jnp.float32)
     found = jax.eval_shape(summarizer, states, actions)
@@ -51,7 +51,7 @@ def size(summarizer: Summarizer, steps: int, state_size: int, action_size: int) 
 
 
 def stream(name: str, steps: int, state_size: int, action_size: int, **options: int) -> Stream:
-    """The streaming form of summarizer `name` for trajectories of `steps` actions; names and options as in `get`.
+    """Find the streaming form of summarizer `name` for trajectories of `steps` actions; names and options as in `get`.
 
     Raises:
         UserError: if the summary has no streaming form, is too large, or `steps` are too few.
@@ -64,7 +64,7 @@ def stream(name: str, steps: int, state_size: int, action_size: int, **options: 
 
 
 def feature_names(summary: str, steps: int, states: Sequence[str], actions: Sequence[str]) -> tuple[str, ...]:
-    """A name for every feature of `summary` (as in `get`) of trajectories of `steps` actions, in order.
+    """Name every feature of `summary` (as in `get`) of trajectories of `steps` actions, in order.
 
     Raises:
         UserError: a user's own summary that fails, or gives other numbers of names and features.

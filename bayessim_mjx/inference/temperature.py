@@ -19,24 +19,20 @@ from jax.scipy.special import ndtri
 from jax.typing import ArrayLike
 
 from bayessim_mjx.distributions import Distribution, box, charts
+from bayessim_mjx.inference.numbers import DOUBT, FEW
 from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 
 TEMPERATURES = np.geomspace(1.0, 4.0, 15).astype(np.float32)  # factors tried; source: rule of thumb, not counted
-FEW = 64  # points behind the mass of a Gaussian in the box, 512 in Distribution.from_unit; source: cost alone
 Mixtures = tuple[Array, Array, Array]  # log weights [n, K], means [n, K, d], Cholesky factors of covariances
 
-DRAWS = 64  # of each posterior; source: cost alone, levels in steps of 1/64
-MOST = 512  # rows in which levels are counted; source: cost alone
-TOGETHER = 64  # of them at once; source: memory alone
 # factors on sharpness, tried; 1.1 to 1.2 were found to be enough on BayesSimIG's data. source: docs/inference.md
 FACTORS = np.geomspace(0.75, 1 / 0.75, 15).astype(np.float32)
 LEVELS = (0.5, 0.8, 0.95)  # mass of the regions of highest density in which truths are counted
 REGIONS = np.asarray(LEVELS, np.float32)
-DOUBT = 0.15  # sd of the factor's log beforehand: a few rows are off by chance; source: rule of thumb, not counted
 
 
 def tempered(posterior: Distribution, factor: float | Array) -> Distribution:
-    """Standard deviations of every component times `factor`, but never beyond the prior's; for jax.vmap too."""
+    """Multiply standard deviations of every component by `factor`, but never beyond the prior's; for jax.vmap too."""
     q = posterior
     return Distribution.from_unit(q.space, q.logits, *_spread(q, factor), q.prior_weight, q.chart)
 
@@ -59,7 +55,7 @@ def _spread(q: Distribution, factor: float | Array) -> tuple[Array, Array]:
 
 
 def temperature(posteriors: Distribution, thetas: Array, weights: ArrayLike | None = None) -> float:
-    """The factor >= 1 on standard deviations that gives batched posteriors the highest mean log density at thetas.
+    """Find the factor >= 1 on standard deviations with the highest mean log density of batched posteriors at thetas.
 
     thetas [n, d]; weights [n], 0 for pairs to leave out.
     """
@@ -105,12 +101,12 @@ def coverage_levels(
 
     n, d = z.shape
     # one call for all random numbers: each is a program of its own size, and several were a fifth of the compilation
-    uniforms = jax.random.uniform(key, (n, DRAWS * (1 + d) + 1), minval=1e-7)
+    uniforms = jax.random.uniform(key, (n, FEW * (1 + d) + 1), minval=1e-7)
 
     def one(inputs: tuple[Array, Array, Array, Array, Array, Array]) -> Array:
         uniform, logits, means, scales, z, mass = inputs
-        chance, rank = uniform[:-1].reshape(DRAWS, 1 + d), uniform[-1]
-        part, worth = box.choose(chance[:, 0], logits + mass), jnp.ones(DRAWS)
+        chance, rank = uniform[:-1].reshape(FEW, 1 + d), uniform[-1]
+        part, worth = box.choose(chance[:, 0], logits + mass), jnp.ones(FEW)
         if inside is None:
             noise = ndtri(chance[:, 1:])
             draws = means[part] + jnp.sum(scales[part] * noise[:, None, :], axis=-1)
@@ -122,19 +118,19 @@ def coverage_levels(
         gap = points[:, None, None, :] - means[None, :, None, :]
         away = jnp.where(
             keep[None, None, :], jnp.sum(inverse_lower(scales)[None] * gap, axis=-1), 0.0
-        )  # [1 + DRAWS, K, d]
+        )  # [1 + FEW, K, d]
         size = jnp.sum(jnp.log(jnp.diagonal(scales, axis1=-2, axis2=-1)), axis=-1)
         density = jax.nn.logsumexp((logits - size)[None] - 0.5 * jnp.sum(away * away, axis=-1), axis=-1)
         density = density + charts.log_slope(jnp.where(keep[None, :], points, charts.NEUTRAL[chart][0]), chart)
         # a Gaussian as flat as a prior is hardly ever inside: with all coordinates no draw might be left
         here = jnp.all((draws >= 0) & (draws <= 1) | ~keep[None, :], axis=-1) | (chart != "plain")
-        which = jnp.stack([density[1:] > density[0], density[1:] == density[0], jnp.ones(DRAWS, bool)])
+        which = jnp.stack([density[1:] > density[0], density[1:] == density[0], jnp.ones(FEW, bool)])
         denser, equal, whole = jnp.sum(jnp.where(here[None] & which, worth[None], 0.0), axis=-1)
-        own = 1.0 if inside is None else whole / DRAWS  # the truth is one more draw
+        own = 1.0 if inside is None else whole / FEW  # the truth is one more draw
         return (denser + (equal + own) * rank) / (whole + own)
 
     masses = jnp.zeros_like(mixtures[0]) if inside is None else inside
-    return jax.lax.map(one, (uniforms, *mixtures, z, masses), batch_size=TOGETHER)
+    return jax.lax.map(one, (uniforms, *mixtures, z, masses), batch_size=FEW)
 
 
 def coverage_factor(
@@ -146,7 +142,7 @@ def coverage_factor(
     chart: str,
     inside: Array | None = None,
 ) -> Array:
-    """The factor on sharpness, of FACTORS, at which REGIONS hold truths z [n, d] (with mask [n] 1) as they should.
+    """Find the factor of FACTORS on sharpness at which REGIONS hold truths z [n, d] (mask [n] 1) as they should.
 
     at(factor) gives the mixtures; keep [d] and inside as in `coverage_levels`. A region of p holds p of n truths to
     within sqrt(p (1 - p) / n), and the log of the factor is held to be within DOUBT of 0 beforehand.

@@ -16,29 +16,26 @@ from jax.flatten_util import ravel_pytree
 
 from bayessim_mjx.inference import densities, mdn
 from bayessim_mjx.inference.densities import Params, density_of
+from bayessim_mjx.inference.numbers import DEFENSIVE, NEGLIGIBLE
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.inference.state import Data
 from bayessim_mjx.keys import GOLDEN
 from bayessim_mjx.linalg import REGRESSED, inverse_lower, product, ridge
 
-CURVE = 40  # times, at least, that the losses are looked at; source: rule of thumb, not measured
 # factor on steps in the trials of bases: at the full rate whitening was once chosen on the damped pendulum, 6.2 nats
 # for 7.3; at half none of six seeds did. source: benchmarks/history.md, posteriors
 PACE = 0.5
-# gradient steps at least (and a fortieth) that bases are tried for, and before a training may end early; source: rule
-# of thumb, not counted
-TRIED = 150
 MEMBERS = "members"  # axis of the ensemble
-# smallest precision beyond the prior's that a component of the probit chart starts with; source: rule of thumb, not
-# counted
-WEAK = 0.05
 
 
 def schedule_length(settings: InferenceSettings, capacity: int) -> tuple[int, int]:
     """(points of the loss curve, gradient steps per point) for arrays of `capacity` rows."""
     per_epoch = -(-capacity // settings.batch)
     total = min(max(settings.epochs * per_epoch, settings.min_steps), settings.max_steps)
-    chunk = max(1, min(per_epoch, total // CURVE)) if per_epoch > 1 else max(1, total // (2 * CURVE))
+    # the losses are looked at once an epoch, and as often where the rows are few or the steps limited
+    chunk = (
+        max(1, min(per_epoch, total // settings.epochs)) if per_epoch > 1 else max(1, total // (2 * settings.epochs))
+    )
     return -(-total // chunk), chunk
 
 
@@ -50,7 +47,7 @@ def objective(
     drop: densities.Drop | None = None,
     x: Array | None = None,
 ) -> Array:
-    """The objective of training, per row: log q(theta | x), less the log of its integral under the proposal."""
+    """Compute the objective of training, per row: log q(theta | x), less the log of its integral under the proposal."""
     x = data.x[rows] if x is None else x
     return objective_of(mdn.forward(params, x, data.y.shape[-1], settings, drop), rows, data, settings)
 
@@ -82,7 +79,7 @@ class _Member:
     def objective(
         self, flat: Array, basis: Array, rows: Array, seen: Array, drop: densities.Drop | None = None
     ) -> Array:
-        """The objective of rows [B], by the summaries `seen` [B] of them."""
+        """Compute the objective of rows [B], by the summaries `seen` [B] of them."""
         params = {**self.unravel(flat), **self.fixed}
         return objective(params, rows, self.data, self.settings, drop, self.data.x[basis, seen])
 
@@ -133,7 +130,7 @@ def train(
     """One member: its best weights, their basis, where they were on the curve, steps taken and skipped, curves [2, P].
 
     In a first training each member tries another basis for a while, then all start anew in the best of them. It ends
-    early if no member has beaten the best start, the linear-Gaussian posterior, in a fortieth of it.
+    early if no member has beaten the best start, the linear-Gaussian posterior, in a tenth of it.
 
     Args:
         key: consumed.
@@ -146,7 +143,7 @@ def train(
     points, chunk = schedule_length(settings, rows)
     params = jax.vmap(lambda x: _start(params, data._replace(x=x), settings, fresh))(data.x[:, :rows])
     member, starts = _member(params, rate, data, settings, points * chunk)
-    patience = max(points // 40, -(-TRIED // chunk))
+    patience = max(1, round(DEFENSIVE * points))
     trial = patience if tried > 1 else 0
     values = jax.vmap(member.held_out)(starts, jnp.arange(tried, dtype=jnp.int32))
 
@@ -178,7 +175,7 @@ def train(
 
 
 def _member(params: Any, rate: Array, data: Data, settings: InferenceSettings, steps: int) -> tuple[_Member, Array]:
-    """The parts of a training of so many steps, and its weights [M, W] in each basis; params have leaves [M, ...]."""
+    """Make the parts of a training of so many steps, and its weights [M, W] by basis; params have leaves [M, ...]."""
     optimiser = optax.chain(
         optax.clip_by_global_norm(settings.grad_clip),
         optax.adamw(optax.cosine_decay_schedule(settings.lr, steps), weight_decay=settings.weight_decay),
@@ -191,7 +188,7 @@ def _member(params: Any, rate: Array, data: Data, settings: InferenceSettings, s
 
 
 def _start(params: Any, data: Data, settings: InferenceSettings, fresh: Array) -> Any:
-    """The weights that training starts from: of a first fit, the linear-Gaussian posterior."""
+    """Set the weights that training starts from: of a first fit, the linear-Gaussian posterior."""
     held = jnp.zeros_like(data.train).at[data.held].set(data.mask > 0)
     x, prepare, new = mdn.embedded(params, data.x, settings), densities.density_of(settings).prepare, params
     if prepare is not None:
@@ -246,6 +243,6 @@ def linear_start(params: Params, x: Array, y: Array, weights: Array, settings: I
 def _beyond_prior(mean: Array, slope: Array, cov: Array) -> tuple[Array, Array, Array]:
     """Centre mu, its slope and (A^T A)^-1 of the component of precision I + A^T A with that posterior mean and cov."""
     values, vectors = jnp.linalg.eigh(cov)
-    extra = jnp.maximum(1 / values - 1, WEAK)  # eigenvalues of A^T A
+    extra = jnp.maximum(1 / values - 1, NEGLIGIBLE)  # eigenvalues of A^T A
     stretch = product(vectors * ((1 + extra) / extra)[None, :], vectors.T)  # m = (I + A^T A)^-1 A^T A mu
     return stretch @ mean, product(slope, stretch), product(vectors / extra[None, :], vectors.T)

@@ -16,31 +16,27 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from scipy.special import log_ndtr
+from scipy.stats import norm
 
 from bayessim_mjx.distributions import box
-from bayessim_mjx.inference.temperature import FEW
+from bayessim_mjx.inference.mixture_fit import FLAT
+from bayessim_mjx.inference.numbers import EPS, FEW, ROUNDED
 from bayessim_mjx.linalg import cholesky, inverse_lower, lower_factor, product
 
-# sd from a mean to an end of its range; outside, nothing is changed; source: rule of thumb, not counted
-NEAREST, FARTHEST = 0.4, 5.0
-# times its standard deviation that a Gaussian may become; 2, 3 and 4 gain 6.97, 6.97 and 6.96 nats.
-# source: docs/decisions/truncation_moments.md
-WIDEST = 3.0
-# of the table: its entries, and steps of Newton and of bisection; source: the table is off by 1e-7
-GRID, STEPS = 93, 24
-# log mass inside before and after, below which a Gaussian stays as it is; -1, -2 and -5 before gain 7.65 nats each.
-# source: the problems of docs/decisions/truncation_moments.md; FAR is a rule of thumb
-OUTSIDE, FAR = -2.0, -20.0
+# sd from a mean to an end of its range: nearer no part of a Gaussian has its mean, beyond the other the cut is rounding
+NEAREST, FARTHEST = 1.0, float(norm.isf(EPS))
+WIDEST = FLAT * 12**0.5  # times its standard deviation that a Gaussian may become: a uniform one's as flat
+STEPS = np.finfo(np.float32).nmant + 1  # of Newton and of bisection, one for each bit
 
 
 @lru_cache(maxsize=1)
 def _table() -> tuple[np.ndarray, np.ndarray]:
     """Means and log standard deviations [G, G] of the Gaussians that have mean 0 and sd 1 on [-a, b], by bisection."""
-    ends = np.linspace(NEAREST, FARTHEST, GRID)
+    ends = np.linspace(NEAREST, FARTHEST, FEW)
     a, b = np.meshgrid(ends, ends, indexing="ij")
 
     def centred(mean: np.ndarray, sd: np.ndarray) -> np.ndarray:
-        """The mean of the Gaussian whose part on [-a, b] has mean 0, by Newton's steps."""
+        """Find the mean of the Gaussian whose part on [-a, b] has mean 0, by Newton's steps."""
         for _ in range(STEPS):
             off, spread = _cut(mean, sd, a, b)
             mean = mean - np.clip(off * (sd / spread) ** 2, -sd, sd)
@@ -70,9 +66,9 @@ def _cut(mean: np.ndarray, sd: np.ndarray, a: np.ndarray, b: np.ndarray) -> tupl
 
 def _looked_up(table: Array, a: Array, b: Array) -> Array:
     """Bilinear between the entries of a table [G, G]."""
-    step = (FARTHEST - NEAREST) / (GRID - 1)
+    step = (FARTHEST - NEAREST) / (FEW - 1)
     x, y = ((jnp.clip(v, NEAREST, FARTHEST) - NEAREST) / step for v in (a, b))
-    i, j = (jnp.clip(v.astype(jnp.int32), 0, GRID - 2) for v in (x, y))
+    i, j = (jnp.clip(v.astype(jnp.int32), 0, FEW - 2) for v in (x, y))
     u, v = x - i.astype(jnp.float32), y - j.astype(jnp.float32)
     near, far = ((1 - v) * table[k, j] + v * table[k, j + 1] for k in (i, i + 1))
     return (1 - u) * near + u * far
@@ -85,7 +81,7 @@ def shapes(means: Array, scales: Array) -> tuple[Array, Array]:
     """
     sd = jnp.sqrt(jnp.sum(scales**2, axis=-1))
     a, b = means / sd, (1 - means) / sd
-    at, log_sd = (jnp.where(jnp.minimum(a, b) < NEAREST, 0.0, _looked_up(jnp.asarray(t), a, b)) for t in _table())
+    at, log_sd = (jnp.where(jnp.minimum(a, b) < 0, 0.0, _looked_up(jnp.asarray(t), a, b)) for t in _table())
     unit = scales / sd[..., None]
     together = product(unit, jnp.swapaxes(unit, -1, -2))  # correlations
     lost = -jnp.expm1(-2 * log_sd)  # of each coordinate's precision
@@ -103,16 +99,16 @@ def shapes(means: Array, scales: Array) -> tuple[Array, Array]:
 
 
 def weighed(logits: Array, means: Array, scales: Array) -> tuple[Array, Array, Array, Array]:
-    """A mixture [n, K, ...] of Gaussians before the cut, and the log mass [n, K] of each inside the cube.
+    """Weigh Gaussians before the cut: their mixture [n, K, ...], and the log mass [n, K] of each inside the cube.
 
     Each keeps its mass there, relative to the others. Gaussians that are all but outside stay: their moments are not
     those of anything inside.
     """
     wide = shapes(means, scales)
     both = (jnp.concatenate(pair, axis=1) for pair in zip((means, scales), wide, strict=True))  # compiled once
-    masses = jax.lax.map(lambda row: box.log_masses(row[0], row[1], FEW), tuple(both), batch_size=64)
+    masses = jax.lax.map(lambda row: box.log_masses(row[0], row[1], FEW), tuple(both), batch_size=FEW)
     before, after = jnp.split(masses, 2, axis=1)
-    use = (before > OUTSIDE) & (after > FAR) & jnp.all(jnp.isfinite(wide[1]), axis=(-1, -2))
+    use = (before > ROUNDED) & (after > ROUNDED) & jnp.all(jnp.isfinite(wide[1]), axis=(-1, -2))
     inside = jnp.where(use, after, before)
     return (
         jax.nn.log_softmax(logits) + before - inside,

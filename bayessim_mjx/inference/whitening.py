@@ -8,27 +8,25 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.inference.densities import density_of
+from bayessim_mjx.inference.numbers import DRAWS, EPS
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.linalg import product, ridge
 
 LIMIT = 512  # features up to which they are whitened; source: 3262ad5, Ant's 600 features
-# features from which on a regression on the parameters is tried too; source: rule of thumb, not counted
-MANY = 128
-MOST = 4096  # features up to which a regression on them is made; source: cost alone
-FLOOR = 1e-3  # added to the noise's variances: rounding is not to be blown up; source: rule of thumb, not counted
-EPS = 1e-6  # of a direction that neither parameters nor noise move; source: float32
+FLOOR = EPS**0.5  # added to the noise's variances: rounding is not to be blown up
 
 
 def width(settings: InferenceSettings, dim_x: int, d: int) -> int:
-    """Number of inputs of a network of d parameters: all D features, or two `regressed` ones for each parameter."""
-    return min(2 * d, dim_x) if LIMIT < dim_x <= MOST and _may_change(settings) and d else dim_x
+    """Count the inputs of a network of d parameters: all D features, or two `regressed` ones for each parameter."""
+    return min(2 * d, dim_x) if LIMIT < dim_x <= DRAWS and _may_change(settings) and d else dim_x
 
 
 def count(settings: InferenceSettings, dim_x: int) -> int:
-    """Number of bases that are tried, each by another member of the ensemble (the last one is linear at first)."""
+    """Count the bases that are tried, each by another member of the ensemble (the last one is linear at first)."""
     if not _may_change(settings) or dim_x > LIMIT or settings.ensemble < 3:
         return 1
-    return 2 + (dim_x > MANY)
+    # a regression on the parameters too, where there are more features than units that learn of them
+    return 2 + (dim_x > max(settings.hiddenLayers, default=0))
 
 
 def _may_change(settings: InferenceSettings) -> bool:
@@ -48,7 +46,7 @@ def candidates(x: Array, y: Array, train: Array, tried: int, noise: Array | None
 
 
 def padded(basis: Array) -> Array:
-    """A basis [D, few] as [D, D]: the other inputs are 0, and these so large that first weights for D see as much."""
+    """Pad a basis [D, few] to [D, D]: other inputs are 0, and these so large that first weights for D see as much."""
     dim_x, few = basis.shape
     return jnp.zeros((dim_x, dim_x)).at[:, :few].set(basis * np.sqrt(dim_x / few))
 

@@ -21,7 +21,7 @@ POLICY_DEPENDENT = ("policy_rl", "policy_rl_randomized")
 
 
 def policy_function(name: str, policy: Policy, action_size: int, memory: int = 0) -> Callable[[Array, dict], Array]:
-    """The collection policy `name` as a function (key, obs of one world) -> action [action_size].
+    """Return the collection policy `name` as a function (key, obs of one world) -> action [action_size].
 
     memory: numbers at the end of an action that are the policy's memory (`rl.recurrent`), 0 where it is not asked.
     random is symmetric, U[-1, 1]; rl_randomized flips its coin for every world and step by itself. The policy's arrays
@@ -75,17 +75,17 @@ class SummaryInputs:
     context: tuple[str, ...] = ()  # features after those of the summary
 
     def features(self, summary: str) -> tuple[str, ...]:
-        """A name for every feature."""
+        """Name every feature."""
         return (*feature_names(summary, self.steps, self.states, self.actions), *self.context)
 
     def embedding(self, summary: str) -> Any:
-        """The network that learns features from the summary (summaries/learned.py); None: the summary has them."""
+        """Make the network that learns features from the summary (summaries/learned.py); None: the summary has them."""
         learn = summaries.entry(summary)[0].embedding
         return None if learn is None else learn(self.steps, len(self.states), len(self.actions))
 
 
 def named(names: Sequence[str], size: int, kind: str) -> tuple[str, ...]:
-    """These names, or numbers where there are not as many as `size`."""
+    """Return these names, or numbers where there are not as many as `size`."""
     return tuple(names) if len(names) == size else tuple(f"{kind} {i + 1}" for i in range(size))
 
 

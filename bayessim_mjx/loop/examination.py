@@ -21,31 +21,29 @@ from jax import Array
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import checks, local_recalibration, product_calibration, rounds
 from bayessim_mjx.inference.calibration import Report
+from bayessim_mjx.inference.numbers import DRAWS, FEW
 from bayessim_mjx.inference.product_calibration import Sets
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import ranges
 from bayessim_mjx.loop.posterior import conditioned, kept, multiplied
-from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round, slot_of
+from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round, Situation, slot_of
 from bayessim_mjx.loop.trajectories import at, features, proposal_of, simulated
 from bayessim_mjx.quantities import fixed
 from bayessim_mjx.rl import Policy
 
-# simulated sets of trajectories that judge a posterior; 64 are too few for a widening of less than one step of
-# product_calibration.FACTORS. source: docs/inference.md, several trajectories; the number itself is a rule of thumb
-SETS = 64
-# trajectories in one set, at most: beyond that the error that all of them share is taken to stay (`Sets.widening`).
-# source: rule of thumb, not counted
-MOST = 32
-PAIRS, LOTS = 500, 4  # `reexamine` judges one lot of sets for each 500 pairs, at most 4 lots; source: cost alone
-REFERENCE = 10000  # simulations that `reexamine` compares real trajectories with, at most; source: cost alone
+# simulated sets of trajectories that judge a posterior: too few for a widening of less than one step of
+# product_calibration.FACTORS (docs/inference.md, several trajectories)
+SETS = FEW
+# trajectories in one set, at most: beyond that the error that all of them share is taken to stay (`Sets.widening`)
+MOST = FEW
 
 
 def calibrate_product(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
     """Move and widen the product as simulated sets of as many trajectories require."""
     if round_.loop.settings.temperature:
         return answer, Evidence()
-    clock, known, now = time.perf_counter(), round_.known, (round_.loop, round_.state, round_.policy)
-    found = recalibrated(*now, known, answer.posterior, judge(*now, known))
+    clock, known = time.perf_counter(), round_.known
+    found = recalibrated(round_, answer.posterior, judge(round_))
     if found is None:
         return answer, Evidence()
     seconds = {"check": time.perf_counter() - clock}
@@ -53,40 +51,37 @@ def calibrate_product(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
     return used, Evidence({"sets": found}, scores(found, known), seconds=seconds)
 
 
-def judge(loop: Loop, state: LoopState, policy: Policy, known: int) -> Sets | None:
-    """Products of 1, 2, 4 ... `known` posteriors on fresh sets, as the round multiplies them.
+def judge(now: Situation) -> Sets | None:
+    """Judge products of 1, 2, 4 ... posteriors on fresh sets, as the round multiplies them.
 
     None where there is nothing to judge: a single trajectory, tests switched off, or a division by the proposal, which
     takes the real posteriors alone.
     """
-    if not loop.settings.checkTrajs:
-        return None
-    key = branch(loop.key(int(state.round), "fit"), 4)
-    found = _simulated(loop, state, policy, known, key)
-    return None if found is None else replace(product_calibration.judge(*found, loop.settings.components), known=known)
+    b = now.loop.settings
+    found = _simulated(now, branch(now.loop.key(now.number, "fit"), 4)) if b.checkTrajs else None
+    return None if found is None else replace(product_calibration.judge(*found, b.components), known=now.known)
 
 
-def recalibrated(
-    loop: Loop, state: LoopState, policy: Policy, known: int, product: Distribution, found: Sets | None
-) -> Sets | None:
-    """`judge`'s answer, with what sets at draws of the posterior of the `known` real trajectories ask for."""
+def recalibrated(now: Situation, product: Distribution, found: Sets | None) -> Sets | None:
+    """Add to `judge`'s answer the results of sets at draws of the posterior of the real trajectories."""
     if found is None or float(product.prior_weight) >= rounds.REGION:  # else they are those of the prior
         return found
-    key = branch(loop.key(int(state.round), "fit"), 6)
+    key = branch(now.loop.key(now.number, "fit"), 6)
 
     def drawn(posterior: Distribution, turn: int) -> tuple[list[list[Distribution]], np.ndarray] | None:
-        return _simulated(loop, state, policy, known, branch(key, turn), posterior)
+        return _simulated(now, branch(key, turn), posterior)
 
-    return local_recalibration.recalibrated(found, product, drawn, loop.settings.components)
+    return local_recalibration.recalibrated(found, product, drawn, now.loop.settings.components)
 
 
 def _simulated(
-    loop: Loop, state: LoopState, policy: Policy, known: int, key: Array, around: Distribution | None = None
+    now: Situation, key: Array, around: Distribution | None = None
 ) -> tuple[list[list[Distribution]], np.ndarray] | None:
-    """Sets of factors and the thetas [m, d] that they were simulated at; None where hardly any is a density.
+    """Simulate sets of factors and the thetas [m, d] that they were simulated at; None where hardly any is a density.
 
     around: what thetas are drawn from; None: what the round is simulated from.
     """
+    loop, state, known = now.loop, now.state, now.known
     b, source = loop.settings, loop.source
     if known < 2 or b.proposal == "division" or source is None:
         return None
@@ -98,7 +93,7 @@ def _simulated(
     )
     columns = []
     for k in keys:  # the same program for any number of trajectories
-        x = features(source, k, thetas[None], policy)
+        x = features(source, k, thetas[None], now.policy)
         factors = kept(conditioned(state.fit, x, state.temperature), state.fit.identified, b.priorShare)
         columns.append(jax.tree.map(np.asarray, factors).split())
     rows = [[column[i] for column in columns] for i in range(SETS)]
@@ -152,7 +147,7 @@ def _moved(last: Distribution, posterior: Distribution) -> bool:
 
 
 def reused_posterior(state: LoopState) -> str:
-    """A sentence on a finished round that uses the posterior of an earlier one; "" where it uses its own."""
+    """Write a sentence on a finished round that uses an earlier posterior; "" where it uses its own."""
     stands, done = int(state.standing_round or 0), int(state.round)
     if stands in (0, done):
         return ""
@@ -171,10 +166,12 @@ def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: in
     domain = state.domain
     assert source is not None and domain is not None
     key = branch(branch(jax.random.PRNGKey(seed), 0xCA11), done)  # seen by no fit
-    known = min(b.trainTrajs, REFERENCE)
+    known = min(b.trainTrajs, DRAWS)
     used = None if state.proposals is None else at(state.proposals, slot_of(loop, state, done))
     state, temperature = ranges.as_fitted(replace(state, proposal=used)), float(state.temperature)
-    thetas, x, _ = simulated(source, branch(key, 1), policy, proposal_of(loop, state), b.proposal, known + pairs)
+    proposal = proposal_of(loop, state)
+    drawn = lambda key, n: rounds.draw(key, proposal, b.proposal, n)  # noqa: E731
+    thetas, x, _ = simulated(source, branch(key, 1), policy, drawn, known + pairs)
     held = thetas[known:], x[known:]
     rows = slice((done - 1) * b.realTrajs if source.policy_dependent else 0, done * b.realTrajs)
     judged: dict[str, Any] = {"temperature": temperature, "tilt": used if b.proposal == "apt" else None}
@@ -184,23 +181,21 @@ def reexamine(loop: Loop, state: LoopState, policy: Policy, pairs: int, seed: in
     )  # fmt: skip
     again = checks.replicated(branch(key, 2), state.fit, held[1], lambda k, t: source.simulate(k, t, policy), **judged)
     report = replace(verdict[0], predictive=again)
-    before = replace(state, round=state.round - 1)
-    more = min(max(pairs // PAIRS, 1), LOTS)
-    sets = rejudge(loop, before, policy, done * b.realTrajs, branch(key, 3), more)
+    now = Situation(loop, replace(state, round=state.round - 1), policy)
+    lots = max(1, pairs // (SETS * min(now.known, MOST)))  # sets of as many trajectories as there are pairs
+    sets = rejudge(now, branch(key, 3), lots)
     return replace(checks.conclude(report, verdict[1], domain, b.distrust), sets=sets)
 
 
-def rejudge(loop: Loop, state: LoopState, policy: Policy, known: int, key: Array, more: int = 1) -> Sets | None:
-    """Products as the round used them, as it widened and moved them, judged on `more` times as many sets, unseen by it.
-
-    `state` is that of the round, with its network, temperature, proposal and real trajectories' posteriors.
-    """
-    product, used, k = multiplied(loop, state, known)[0], None, loop.settings.components
-    if not loop.settings.temperature:
-        used = recalibrated(loop, state, policy, known, product, judge(loop, state, policy, known))
+def rejudge(now: Situation, key: Array, more: int = 1) -> Sets | None:
+    """Judge products as the round used them, widened and moved, on `more` times as many sets, unseen by it."""
+    b, known = now.loop.settings, now.known
+    product, used, k = multiplied(now.loop, now.state, known)[0], None, b.components
+    if not b.temperature:
+        used = recalibrated(now, product, judge(now))
 
     def again(first: int, around: Distribution | None) -> tuple[list[list[Distribution]], np.ndarray] | None:
-        lots = [_simulated(loop, state, policy, known, branch(key, first + i), around) for i in range(more)]
+        lots = [_simulated(now, branch(key, first + i), around) for i in range(more)]
         good = [lot for lot in lots if lot is not None]
         return ([row for lot in good for row in lot[0]], np.concatenate([lot[1] for lot in good])) if good else None
 

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import gammainc, gammaln
 
 from bayessim_mjx.distributions.charts import from_chart, to_chart
+from bayessim_mjx.inference.numbers import EPS, FEW, NEGLIGIBLE, TURNS
 from bayessim_mjx.kalman import Gains
 from bayessim_mjx.logs.signals import LEVELS, values_shown
 from bayessim_mjx.loop.noise import FINEST, Linear, Noise, NoiseModel, Starts
@@ -18,21 +19,12 @@ from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.tangent import addresses, difference
 from bayessim_mjx.tracking import Record, close, errors, transitions
 
-# relative change of the log likelihood's unit at which noise and posterior agree; source: rule of thumb, not counted
-SETTLED = 0.1
-# trajectories that the noise is estimated from: 4 were too few (4454ff8). source: rule of thumb, not counted
-LOOKED = 16
-TURNS = 6  # of noise and linear dynamics, at most, before anything is replayed; source: rule of thumb, not counted
-# standard deviations of the posterior: a shorter step to its mean ends these turns; source: rule of thumb, not counted
-NEAR = 0.3
-# step of central differences in z, prior standard deviations: damping was off by 1.1 of its standard deviations with
-# .05, by .02 with .01. source: counted on Cartpole's pole, 32 trajectories
-SLOPE = 0.01
+# step of central differences in z, prior standard deviations: rounding and curvature are alike small (Press et al.,
+# Numerical Recipes, 2007, sec. 5.7). With .05 Cartpole's damping was off by 1.1 of its standard deviations, with .01 by
+# .02.
+SLOPE = EPS ** (1 / 3)
 # longest step in z in which linear dynamics are used, prior standard deviations; source: rule of thumb, not counted
 LEAP = 1.0
-# rad, m, rad/s, m/s: motion of a resting joint by rounding in float32 and in the simulator; source: rule of thumb, not
-# counted
-STILL = 1e-6
 # Rows of one value that tell as much as if their errors were independent: with it root mean squares of z are .92 to .99
 # where encoders show 2 to 52 rows a count, up to 3.5 without. source: benchmarks/inference/counts.py
 ROWS = 4
@@ -99,7 +91,7 @@ class Likelihood:
             if turn == 0:  # along the measurements themselves
                 continue
             near = self._next(theta)
-            if near is None or (near[1] < NEAR and not self._moved(last)):
+            if near is None or (near[1] < NEGLIGIBLE and not self._moved(last)):
                 break
             theta = near[0]
         return self._moved(before)
@@ -109,7 +101,7 @@ class Likelihood:
         self.noise, self.gains = noise, gains
 
     def _next(self, theta: np.ndarray) -> tuple[np.ndarray, float] | None:
-        """The posterior's mean [d] by linear dynamics around theta, and how many of its sd that is away."""
+        """Find the posterior's mean [d] by linear dynamics around theta, and how many of its sd that is away."""
         if self.laplace is None:
             return None
         mean, covariance = self.laplace
@@ -122,7 +114,7 @@ class Likelihood:
         moved = np.abs(np.log(noise.sensor[seen] / before.sensor[seen])).max()
         most = max(before.process.max(), noise.process.max(), 1e-30)
         drift = np.abs(noise.process - before.process).max() / most + abs(noise.lasting - before.lasting)
-        return bool(moved > SETTLED or drift > SETTLED)
+        return bool(max(moved, drift) > NEGLIGIBLE)
 
     def _z(self, theta: np.ndarray) -> np.ndarray:
         return np.asarray(to_chart(self.physics.space.to_unit(jnp.asarray(theta, jnp.float32)), "probit"), float)
@@ -148,7 +140,7 @@ class Likelihood:
         return gains.replace(gain=gains.gain * mask, whitener=gains.whitener * mask)
 
     def _linear(self, theta: np.ndarray, path: Gains, ways: np.ndarray, gaps: np.ndarray) -> Linear:
-        few, each = min(LOOKED, len(self.valid)), self.parts[0].stop
+        few, each = min(FEW, len(self.valid)), self.parts[0].stop
         parts = self.parts[: -(-few // each)]
         z = self._z(theta)
 
@@ -179,7 +171,7 @@ class Likelihood:
         return linear.z + step * min(1.0, LEAP / max(np.abs(step).max(), 1e-30)), np.linalg.inv(precision)
 
     def squares(self, thetas: np.ndarray) -> np.ndarray:
-        """Sums of squared whitened prediction errors [M, N, blocks] at thetas [M, d]."""
+        """Sum squared whitened prediction errors [M, N, blocks] at thetas [M, d]."""
         assert self.gains is not None, "settle first"
         each = [errors(self.physics, thetas, _rows(self.shrunk, part), _rows(self.gains, part)) for part in self.parts]
         return np.concatenate([np.asarray(x, np.float64) for x in each], axis=1)
@@ -226,7 +218,7 @@ def travel(record: Record, model: mujoco.MjModel) -> np.ndarray:
     qpos, qvel = (np.asarray(x, float).reshape(-1, x.shape[-1]) for x in (record.qpos, record.qvel))
     places = addresses(model)
     moved = np.array([min(np.ptp(qpos[:, q]), np.pi) if q is not None else 1.0 for q in places])
-    return np.concatenate([np.maximum(x, max(FINEST * x.max(), STILL)) for x in (moved, np.ptp(qvel, axis=0))])
+    return np.concatenate([np.maximum(x, max(FINEST * x.max(), EPS)) for x in (moved, np.ptp(qvel, axis=0))])
 
 
 def silent(record: Record, model: mujoco.MjModel, sensor: np.ndarray) -> np.ndarray:

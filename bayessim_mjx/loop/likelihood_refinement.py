@@ -19,9 +19,10 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.distributions import Distribution
-from bayessim_mjx.inference import importance, temperature
+from bayessim_mjx.inference import InferenceSettings, importance, temperature
 from bayessim_mjx.inference.final_importance_sampling import UNRELIABLE
-from bayessim_mjx.inference.importance import Refined
+from bayessim_mjx.inference.importance import Problem, Refined
+from bayessim_mjx.inference.numbers import AT_ONCE, NEGLIGIBLE, TURNS
 from bayessim_mjx.keys import branch
 from bayessim_mjx.logs import Channels
 from bayessim_mjx.loop.likelihood import Likelihood
@@ -31,13 +32,6 @@ from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, Round
 from bayessim_mjx.physics.tangent import in_tangent
 from bayessim_mjx.tracking import Record
 
-DRAWS = 1024  # thetas of one call; source: cost alone, others were not measured
-# of the prior, at most: the domain of the next training has mass everywhere; source: rule of thumb, not counted
-SHARE = 1e-4
-PASSES = 5  # at most, of noise and posterior in turn; source: rule of thumb, not counted
-# variance of the scores over the variance that the likelihood promises: from here on a posterior is widened, by 5 % of
-# its standard deviations or more. source: rule of thumb, not counted
-WIDER = 1.1
 # times the squared distance that chance makes: groups that share nothing are moved in .01 to .07 of the cases.
 # source: tests/loop/test_widening.py
 SHARED = 3.0
@@ -54,7 +48,7 @@ def refine_by_replays(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
     if not likelihood.seen.any():
         return answer, Evidence(warnings=warnings)
     seed = int(jax.random.randint(branch(loop.key(round_.number, "fit"), 3), (), 0, 2**31 - 1))
-    found = refine(answer.posterior, likelihood, seed=seed, draws=DRAWS, components=b.components)
+    found = refine(answer.posterior, likelihood, seed=seed, components=b.components)
     seconds = {"refine": time.perf_counter() - clock}
     warnings += [text for text in [found.warning()] if text]
     if not found.used and b.refine == "likelihood":
@@ -63,7 +57,9 @@ def refine_by_replays(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
     if not found.used:
         return answer, evidence
     posterior = found.posterior.reduce(b.components).rechart(loop.chart)
-    posterior = dataclasses.replace(posterior, prior_weight=jnp.float32(min(b.priorShare, SHARE)))
+    # of the prior as much as in any posterior: the domain of the next training has mass everywhere
+    share = min(b.priorShare, InferenceSettings.defensive)
+    posterior = dataclasses.replace(posterior, prior_weight=jnp.float32(share))
     return dataclasses.replace(answer, posterior=posterior, source="replays"), evidence
 
 
@@ -84,7 +80,7 @@ def scores(found: Refinement) -> dict[str, float]:
 
 
 def _likelihood(loop: Loop, state: LoopState, known: int) -> Likelihood:
-    """The likelihood of the first `known` real trajectories; windows of one log are one group."""
+    """Make the likelihood of the first `known` real trajectories; windows of one log are one group."""
     physics, source = loop.env.physics, loop.source  # type: ignore[attr-defined]
     model, each = physics.mj_model, loop.settings.realTrajs
     if isinstance(source, Recorded):
@@ -143,7 +139,7 @@ class Refinement:
         }
 
     def warning(self) -> str | None:
-        """A warning of weights with a heavy tail; None: there is none."""
+        """Warn of weights with a heavy tail; None: there is none."""
         k = self.refined.shape
         if not self.used or k is None or k <= UNRELIABLE:
             return None
@@ -158,43 +154,47 @@ def _finite(value: float | None) -> float | None:
 
 
 def refine(
-    proposal: Distribution, likelihood: Likelihood, *, seed: int = 0, draws: int = 1024, components: int = 8
+    proposal: Distribution,
+    likelihood: Likelihood,
+    *,
+    seed: int = 0,
+    draws: int = AT_ONCE,
+    components: int = InferenceSettings.components,
 ) -> Refinement:
-    """The posterior of all records, from a proposal that may be wrong.
+    """Find the posterior of all records from a proposal that may be wrong.
 
     Args:
         proposal: e.g. the product of the network's posteriors of the trajectories.
         likelihood: of the records.
-        seed, draws, components: as in `importance.refine`.
+        seed: of the draws; draws, components: as in `importance.Problem`.
     """
-    current, theta = proposal, np.asarray(proposal.mode())
 
     def log_likelihood(thetas: np.ndarray) -> np.ndarray:
         return likelihood.log_likelihood(likelihood.squares(thetas))
 
+    problem, theta = importance.Problem(proposal, log_likelihood, components, draws), np.asarray(proposal.mode())
+    current = problem
     found, kept, simulations = None, None, 0
-    for turn in range(PASSES):
+    for turn in range(TURNS):
         changed = likelihood.settle(theta)
         if found is not None and not changed:
             break
-        found = importance.refine(
-            current, log_likelihood, seed=seed + turn, draws=draws, components=components, also=likelihood.laplace
-        )
+        found = importance.refine(current, seed + turn, likelihood.laplace)
         simulations += found.simulations
         if found.population is None:
             break
         rank = found.reason is None, found.evidence + likelihood.size
         if kept is None or rank > kept[0]:  # noise and posterior need not settle: the likeliest noise counts
             kept = rank, found, (likelihood.noise, likelihood.gains)
-        theta, current = found.theta, found.fitted
+        theta, current = found.theta, replace(problem, proposal=found.fitted)
     if kept is not None:
         _, found, settled = kept
         likelihood.back_to(*settled)
     assert found is not None
     found, widening = replace(found, simulations=simulations), 1.0
     if not found.reason:
-        found = importance.sharpened(found, proposal, log_likelihood, draws=draws, components=components, seed=seed)
-        found, widening = _adjusted(found, proposal, likelihood, log_likelihood, components, seed)
+        found = importance.sharpened(problem, found, seed=seed)
+        found, widening = _adjusted(found, problem, likelihood, seed)
     return Refinement(replace(found, posterior=proposal) if found.reason else found, likelihood.noise, widening)
 
 
@@ -243,7 +243,7 @@ def _grouped(near: np.ndarray, scores: np.ndarray, groups: np.ndarray) -> np.nda
 
 
 def _shrunk(spread: np.ndarray, count: float) -> np.ndarray:
-    """A covariance [d, d] of `count` draws, nearer to I by what chance explains of the way to it.
+    """Move a covariance [d, d] of `count` draws towards I by the part of the way that chance explains.
 
     First its mean variance to 1, then the rest to that (positive-part James-Stein; Ledoit and Wolf, 2004).
     """
@@ -259,32 +259,26 @@ def _beyond(seen: float, chance: float) -> float:
     return max(0.0, 1 - chance / max(seen, 1e-30))
 
 
-def _adjusted(
-    found: Refined, proposal: Distribution, likelihood: Likelihood, log_likelihood: importance.LogLikelihood,
-    components: int, seed: int,
-) -> tuple[Refined, float]:  # fmt: skip
-    """The posterior as wide as the scores say, in no direction narrower; and the largest factor on its sd.
+def _adjusted(found: Refined, problem: Problem, likelihood: Likelihood, seed: int) -> tuple[Refined, float]:
+    """Widen the posterior as the scores say, in no direction narrower; return the largest factor on its sd too.
 
     A posterior of one Gaussian is stretched (open-faced sandwich, Shaby 2014), one of several is tempered, or each of
     its Gaussians stretched where moves do not reach the tempered one.
     """
     assert found.population is not None
     u = found.population.u
-    spread, lower = _spread(u, likelihood.squares(importance.thetas(proposal.space, u)), likelihood)
+    spread, lower = _spread(u, likelihood.squares(importance.thetas(problem.proposal.space, u)), likelihood)
     values, axes = np.linalg.eigh(spread)
     values = np.maximum(values, 1.0)
-    if values.max() < WIDER:
+    if np.sqrt(values.max()) < 1 + NEGLIGIBLE:
         return found, 1.0
     if found.fitted.components > 1 or found.fitted.chart != "plain":
         power, wider = 1 / float(values.mean()), float(np.sqrt(values.mean()))
-        again = importance.tempered(found, proposal, log_likelihood, power, components=components, seed=seed)
+        again = importance.tempered(problem, found, power, seed)
         if again.reason:  # the draws before were the posterior's; the proposal saw no replay at all
             wide = temperature.tempered(found.fitted, wider)
             return replace(found, posterior=wide, fitted=wide, simulations=again.simulations), wider
-        again = importance.sharpened(
-            again, proposal, log_likelihood, draws=len(u), components=components, power=power, seed=seed
-        )
-        return again, wider
+        return importance.sharpened(problem, again, power, seed), wider
     by = lower @ (axes * np.sqrt(values)) @ axes.T @ np.linalg.inv(lower)
     q = found.fitted
     covariance = by @ np.asarray(q.scales[0] @ q.scales[0].T, np.float64) @ by.T

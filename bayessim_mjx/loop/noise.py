@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from bayessim_mjx.inference.numbers import NEGLIGIBLE, TURNS
 from bayessim_mjx.kalman import Force, Gains, innovations, measured_noise, riccati
 from bayessim_mjx.physics.tangent import difference, integrate
 from bayessim_mjx.tracking import Record
@@ -27,12 +28,7 @@ FINER = (3.0**0.5, 3.0**0.25)
 # grid of the forces' correlations from step to step. With white noise alone gusts of ten steps moved the damping by 2.8
 # standard deviations, with these by 1.5. source: commit 95be4ef, 16 cases
 LASTING = (0.7, 0.9, 0.97)
-RATIOS = (0.1, 0.3)  # grid of factors on the velocity's sensor noise alone; source: rule of thumb, not counted
-# steps of EM at most; relative change of a variance that ends them; source: rule of thumb, not counted
-TURNS, ALIKE = 6, 0.05
-# degrees of freedom: 1 / chi^2 of the N - 1 that an estimated mean leaves has the mean 1 / (N - 3).
-# source: exact (Stein); Morris 1983, eqs. 1.16 to 1.18
-LOST = 3
+RATIOS = tuple(q for q in PROCESS if q < 1)  # grid of factors on the velocity's sensor noise alone
 
 
 @dataclass(frozen=True)
@@ -117,7 +113,7 @@ class NoiseModel:
         return np.isfinite(self.floor)
 
     def likely(self, linear: Linear, otherwise: Noise) -> Noise:
-        """The most likely noise, each number that is not needed left out (BIC): first what acts, then the sensors.
+        """Find the most likely noise without numbers that are not needed (BIC): first what acts, then the sensors.
 
         Sensors have one factor in common, or one each where that pays: one joint with an unknown noise, or
         with a friction that the simulator lacks, is no reason to believe the others less.
@@ -171,7 +167,7 @@ class NoiseModel:
             before = np.where(self.seen, noise.sensor, 1.0) ** 2
             after = np.maximum(before + before**2 * (squares - spread) / rows, np.where(self.seen, least, 1.0) ** 2)
             noise = replace(noise, sensor=np.where(self.seen, np.sqrt(after), np.inf))
-            if np.abs(np.log(after / before)).max() < ALIKE:
+            if np.abs(np.log(after / before)).max() < NEGLIGIBLE:
                 break
         return noise
 
@@ -185,7 +181,7 @@ class NoiseModel:
         return riccati(ways, noise.sensor, white, self._start(noise))
 
     def _start(self, noise: Noise) -> np.ndarray:
-        """Standard deviations of the start state: as measured, or anything where it is not."""
+        """Take standard deviations of the start state: as measured, or anything where it is not."""
         known = np.where(self.seen, noise.sensor, 1.0) / np.where(self.seen, self.floor, 1.0)
         return np.where(self.seen, known * self.starts.sd(self.floor), 0.3 * self.scale)
 
@@ -216,6 +212,8 @@ class Starts:
     Attributes:
         count: N.
         away: `[N, 2 nv]` position tangents and velocities, from their means.
+        freedom: 1 / chi^2 of the N - 1 degrees of freedom that an estimated mean leaves has the mean 1 / (N - 3)
+            (Stein; Morris 1983, eqs. 1.16 to 1.18).
     """
 
     def __init__(self, record: Record, model: mujoco.MjModel) -> None:
@@ -224,21 +222,19 @@ class Starts:
         away = jax.vmap(lambda q: difference(model, q, qpos[0]))(qpos)
         channels = np.concatenate([np.asarray(away, float), np.asarray(qvel, float)], axis=1)
         self.count, self.away = len(channels), channels - channels.mean(0)
+        self.freedom = max(self.count - 3, 0)
 
     def share(self, sensor: np.ndarray) -> np.ndarray:
         """[2 nv] of the measured spread that is noise of these standard deviations; 0 where nothing is measured."""
-        seen, freedom = np.isfinite(sensor), self.count - LOST
-        noise = freedom * np.where(seen, sensor, 0.0) ** 2
-        if freedom <= 0:
-            return np.zeros(len(sensor))
+        noise = self.freedom * np.where(np.isfinite(sensor), sensor, 0.0) ** 2
         return np.minimum(noise / np.maximum((self.away**2).sum(0), 1e-300), 1.0)
 
     def sd(self, sensor: np.ndarray) -> np.ndarray:
         """[2 nv] standard deviations of the start that stay unknown, over all of them."""
-        return sensor * np.sqrt(1 - self.share(sensor) * (1 - LOST / self.count) if self.count > LOST else 1.0)
+        return sensor * np.sqrt(1 - self.share(sensor) * self.freedom / self.count)
 
     def shrunk(self, sensor: np.ndarray) -> Record:
-        """The records, from their most likely starts under that noise of the sensors [2 nv]."""
+        """Start the records at their most likely starts under that noise of the sensors [2 nv]."""
         nv, r = self.model.nv, self.record
         step = jnp.asarray(-self.share(sensor) * self.away, jnp.float32)
         qpos = jax.vmap(lambda q, by: integrate(self.model, q, by))(r.qpos[:, 0], step[:, :nv])

@@ -87,7 +87,7 @@ def make(config: Config, env: Env) -> Loop:
 
 
 def init(loop: Loop, trains: bool = True) -> LoopState:
-    """The state before round 0: an untrained policy, the prior as domain, no data.
+    """Make the state before round 0: an untrained policy, the prior as domain, no data.
 
     trains: whether training comes next, its program then being compiled beside the first reset's.
     """
@@ -97,7 +97,7 @@ def init(loop: Loop, trains: bool = True) -> LoopState:
 
 
 def blank(loop: Loop) -> dict[str, Any]:
-    """The inference's fields of a LoopState before the first round: no data, the prior as domain."""
+    """Make the inference's fields of a LoopState before the first round: no data, the prior as domain."""
     b, space, d = loop.settings, loop.space, len(loop.env.space)
     domain = domain_or_prior(space, b.components, loop.chart)
     infers = b.modelClass is not None
@@ -157,7 +157,7 @@ def train(loop: Loop, state: LoopState, progress: Callable[[dict, TrainState], N
 
 
 def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
-    """The rest of a round, after training: evaluate, collect, fit, condition on all real trajectories."""
+    """Do the rest of a round, after training: evaluate, collect, fit, condition on all real trajectories."""
     started, seconds = time.perf_counter(), {}
     round_, policy = int(state.round), rl.policy_of(state.train)
     returns, lengths = _evaluate(loop, state, policy)

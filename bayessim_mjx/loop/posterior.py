@@ -15,7 +15,8 @@ from bayessim_mjx import inference
 from bayessim_mjx.config import Config
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
-from bayessim_mjx.inference import rounds
+from bayessim_mjx.inference.numbers import NEGLIGIBLE
+from bayessim_mjx.inference.rounds import REGION
 from bayessim_mjx.inference.temperature import widened
 from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, chart_of, space_of
 from bayessim_mjx.loop.trajectories import at
@@ -23,8 +24,6 @@ from bayessim_mjx.parameters.ranged import Ranged
 from bayessim_mjx.quantities import percent
 from bayessim_mjx.rollout import select
 from bayessim_mjx.runs import checkpoints
-
-LOST = 0.05  # mean weight that cannot be divided by the proposal: more is a warning; source: rule of thumb, not counted
 
 
 def condition(loop: Loop, state: LoopState) -> tuple[LoopState, Answer, Evidence]:
@@ -38,17 +37,22 @@ def condition(loop: Loop, state: LoopState) -> tuple[LoopState, Answer, Evidence
 
 
 def _factors(loop: Loop, state: LoopState) -> tuple[Distribution, list[str]]:
-    """q(theta | x) of every real trajectory, leaves [real trajectories, ...], and warnings about them."""
+    """Condition on every real trajectory: q(theta | x), leaves [real trajectories, ...], and warnings."""
     b, seen, warnings = loop.settings, int(state.round) * loop.settings.realTrajs, []
     factors = conditioned(state.fit, state.real_features, state.temperature)
     if b.proposal == "division":
         assert state.proposals is not None
         rows = jax.tree.map(np.asarray, factors).split()
         done = seen + b.realTrajs
-        quotients, lost = rounds.divided(rows[:done], at(state.proposals, 0))
-        factors = jax.tree.map(lambda *leaves: jnp.stack(leaves), *quotients, *rows[done:])
-        if lost > LOST:
-            warnings.append(f"{percent(lost)} of the posterior's weight cannot be divided by the proposal")
+        if float(state.proposals.prior_weight[0]) < REGION:  # else it is the prior itself
+            quotients, lost = zip(*(row.divide(at(state.proposals, 0)) for row in rows[:done]), strict=True)
+            factors = jax.tree.map(lambda *leaves: jnp.stack(leaves), *quotients, *rows[done:])
+        else:
+            lost = (0.0,)
+        if np.mean(lost) > NEGLIGIBLE:
+            warnings.append(
+                f"{percent(float(np.mean(lost)))} of the posterior's weight cannot be divided by the proposal"
+            )
     factors = kept(factors, state.fit.identified, b.priorShare)
     if loop.source.policy_dependent:  # type: ignore[union-attr]
         # an older trajectory was made by an older policy: its posterior stays that of the network of its time
@@ -64,13 +68,13 @@ def conditioned(network: Any, features: Array, widening: Array) -> Distribution:
 
 @jax.jit
 def kept(factors: Distribution, identified: Array, prior_share: float) -> Distribution:
-    """The prior where nothing is identified, and a share of it everywhere."""
+    """Put the prior where nothing is identified, and a share of it everywhere."""
     factors = jax.vmap(inference.restore_prior, in_axes=(0, None))(factors, identified)
     return dataclasses.replace(factors, prior_weight=jnp.full_like(factors.prior_weight, prior_share))
 
 
 def multiplied(loop: Loop, state: LoopState, known: int) -> tuple[Distribution, int]:
-    """The product of the factors of the first `known` real trajectories, and how many are no densities: left out."""
+    """Multiply the factors of the first `known` real trajectories; return how many are no densities too: left out."""
     b = loop.settings
     # on the host: an index on the device compiles each time
     rows = jax.tree.map(np.asarray, state.real_posteriors).split()
@@ -81,7 +85,7 @@ def multiplied(loop: Loop, state: LoopState, known: int) -> tuple[Distribution, 
 
 
 def restored(checkpoint: Path, env: Env, config: Config) -> Distribution | None:
-    """The domain of a checkpoint, for a program that draws physics from it; None where the loop did not write it.
+    """Restore the domain of a checkpoint, to draw physics from it; None where the loop did not write it.
 
     Args:
         checkpoint: its folder.

@@ -15,49 +15,50 @@ from jax import Array
 
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import range_ends
+from bayessim_mjx.inference.numbers import DRAWS
 from bayessim_mjx.inference.range_ends import Pile
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.sources import limits_of
 from bayessim_mjx.loop.state import Evidence, Loop, LoopState, Moving
 from bayessim_mjx.parameters.ranged import Ranged
 
-POOL = 4096  # draws tried at once; source: memory alone
-
 
 def unmoved(space: Ranged) -> Moving:
-    """Before the first round."""
+    """Return the ranges before the first round."""
     zero = jnp.int32(0)
     return Moving(space, space, zero, zero, zero)
 
 
-def has_moved(state: LoopState) -> bool:
-    """Whether the network so far is that of other ranges."""
-    return state.moving is not None and not state.moving.space.same(state.fit.space)
-
-
 def as_fitted(state: LoopState) -> LoopState:
-    """The state with the ranges that its last round had."""
+    """Return the state with the ranges that its last round had."""
     if state.moving is None:
         return state
     return dataclasses.replace(state, moving=state.moving.replace(space=state.fit.space))  # type: ignore[attr-defined]
 
 
+def share(before: Ranged, after: Ranged) -> float:
+    """Return the mass of the prior over the range after a move that lies in the range before."""
+    start, end = (np.asarray(after.to_unit(x), np.float64) for x in (before.low, before.high))
+    return float(np.prod(end - start))
+
+
 def completed(loop: Loop, state: LoopState, thetas: Array) -> Array:
-    """Draws of the prior [N, d], changed where simulations are kept: with the first trainTrajs of them these are draws
-    of the prior over the range as it is now.
+    """Change draws of the prior [N, d] where simulations are kept.
+
+    With the first trainTrajs of them these are draws of the prior over the range as it is now.
     """
     moving, n = state.moving, loop.settings.trainTrajs
     if moving is None or not int(moving.rows) or moving.space.same(moving.covered):
         return thetas
-    kept, share = int(moving.rows), range_ends.share(moving.covered, moving.space)
+    kept, mass = int(moving.rows), share(moving.covered, moving.space)
     rows = np.array(thetas)
     inside = np.flatnonzero(moving.covered.contains(rows[:n]))
-    spare = inside[max(0, round(share * (kept + n)) - kept) :]  # the region has as many already
+    spare = inside[max(0, round(mass * (kept + n)) - kept) :]  # the region has as many already
     prior, key = Distribution.prior(moving.space), loop.key(int(state.round), "simulate")
     found: list[np.ndarray] = []
     while sum(len(drawn) for drawn in found) < len(spare):
         key = branch(key, 1)
-        drawn = prior.sample(key, POOL)
+        drawn = prior.sample(key, DRAWS)
         found.append(np.asarray(drawn)[~np.asarray(moving.covered.contains(drawn))])
     if found:
         rows[spare] = np.concatenate(found)[: len(spare)]
@@ -65,7 +66,7 @@ def completed(loop: Loop, state: LoopState, thetas: Array) -> Array:
 
 
 def room(loop: Loop, state: LoopState) -> tuple[LoopState, int, int]:
-    """The state with room for a round's simulations, their first row, and how many rows there are with them."""
+    """Make room for a round's simulations; return the state, their first row, and how many rows there are with them."""
     n, done = loop.settings.trainTrajs, int(state.round) + 1
     if state.moving is None:
         slots = max(1, loop.capacity // n)
@@ -79,7 +80,7 @@ def room(loop: Loop, state: LoopState) -> tuple[LoopState, int, int]:
 
 
 def mixed(loop: Loop, state: LoopState, thetas: Array, x: Array) -> tuple[LoopState, Array, Array]:
-    """Simulations kept and new in random order where they are draws of the prior together only: any of them may go."""
+    """Mix simulations kept and new where they are draws of the prior together only: any of them may go."""
     moving = state.moving
     if moving is None or moving.space.same(moving.covered):
         return state, thetas, x
@@ -102,7 +103,7 @@ def move(loop: Loop, state: LoopState, posterior: Distribution) -> tuple[Distrib
     moves = tuple(found)
     if space.same(before):
         return posterior, moves, Evidence({"moves": moves})
-    rows = jnp.int32(_kept(loop, state.moving, range_ends.share(before, space)))
+    rows = jnp.int32(_kept(loop, state.moving, share(before, space)))
     moving = state.moving.replace(space=space, covered=before, rows=rows, next=rows)  # type: ignore[attr-defined]
     kept, warnings = {"moving": moving}, []
     if loop.source.policy_dependent:  # type: ignore[union-attr]
@@ -111,16 +112,16 @@ def move(loop: Loop, state: LoopState, posterior: Distribution) -> tuple[Distrib
     return posterior.over(space), moves, Evidence({"moves": moves}, warnings=warnings, kept=kept)
 
 
-def _kept(loop: Loop, moving: Moving, share: float) -> int:
-    """Simulations that stay: as many as, with one more round outside their range, are draws of the prior."""
+def _kept(loop: Loop, moving: Moving, mass: float) -> int:
+    """Count the simulations that stay: as many as, with one more round outside their range, are draws of the prior."""
     n = loop.settings.trainTrajs
     if loop.sequential or not loop.capacity:
         return 0
-    return max(0, min(int(moving.rows), int(share / max(1 - share, 1e-9) * n), loop.capacity - n))
+    return max(0, min(int(moving.rows), int(mass / max(1 - mass, 1e-9) * n), loop.capacity - n))
 
 
 def _forgotten(factors: Distribution | None, space: Ranged) -> Distribution:
-    """The prior over `space` in place of each factor."""
+    """Put the prior over `space` in place of each factor."""
     assert factors is not None
     ends = (
         jnp.broadcast_to(end, np.shape(old))

@@ -13,6 +13,7 @@ from jax import Array
 
 from bayessim_mjx.config import Config
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.inference.numbers import AT_ONCE
 from bayessim_mjx.inference.summaries import Summarizer
 from bayessim_mjx.keys import branch
 from bayessim_mjx.logs import Channels, Log, noise, read_logs, segments
@@ -28,7 +29,6 @@ from bayessim_mjx.tracking import Record
 
 # error of a velocity estimated from positions, in its noise: it lags at transients; source: rule of thumb, not counted
 ESTIMATED_SPEED = 3.0
-REPLAYED = 512  # segments replayed at once at nominal parameters; source: memory alone
 
 
 @dataclasses.dataclass(frozen=True, eq=False)  # compared by identity: static under jit
@@ -116,7 +116,7 @@ class Recorded:
         """Nobody knows it."""
 
     def real(self, key: Array, first: int, count: int, policy: Policy) -> tuple[Array, Trajectory]:
-        """The next `count` segments of the logs and their features."""
+        """Take the next `count` segments of the logs and their features."""
         del key, policy
         index = self.order[(first + np.arange(count)) % len(self.order)]
         qpos, qvel, command = self._of("qpos", "qvel", "command", index=index)
@@ -136,14 +136,14 @@ class Recorded:
         return self.features(index, qpos, qvel), trajectory
 
     def repeated(self, first: int, real: Trajectory, thetas: Array) -> dict[str, Array]:
-        """The segment asked for as number `first` replayed at thetas [n, d]: its motion, see `rollout.replay`."""
+        """Replay the segment asked for as number `first` at thetas [n, d]: its motion, see `rollout.replay`."""
         del real
         index = jnp.full(len(thetas), self.order[first % len(self.order)])
         qpos0, qvel0 = self._of("qpos0", "qvel0", index=index)
         return self._replayed(index, qpos0, qvel0, thetas)
 
     def records(self, index: Array | np.ndarray) -> Record:
-        """The segments index [N] as they were recorded: with the past of their starts, and their controllers."""
+        """Take the segments index [N] as they were recorded: with the past of their starts, and their controllers."""
         near = self._of("around_qpos", "around_qvel", "around_command", index=index)
         law = None if self.law is None else jax.tree.map(lambda x: x[index], self.law)
         qpos, qvel, command = self._of("qpos", "qvel", "command", index=index)
@@ -153,7 +153,7 @@ class Recorded:
         return [jnp.asarray(self.data[name])[index] for name in names]
 
     def _replayed(self, index: Array, qpos0: Array, qvel0: Array, thetas: Array) -> dict[str, Array]:
-        """The segments index [N] from measured states, as they were recorded: past commands, controllers."""
+        """Replay the segments index [N] from measured states, as they were recorded: past commands, controllers."""
         record = self.records(index)
         return replay(self.env.physics, qpos0, qvel0, record.command, thetas, record.around, record.law)
 
@@ -204,9 +204,9 @@ def apart(run: np.ndarray, start: np.ndarray, length: int) -> np.ndarray:
 
 
 def _expected(source: Recorded) -> dict[str, np.ndarray]:
-    """Logs that are expected at nominal parameters: expected_qpos [M, T+1, nq], expected_qvel [M, T+1, nv]."""
+    """Replay the logs at nominal parameters: expected_qpos [M, T+1, nq], expected_qvel [M, T+1, nv]."""
     count = len(source.pool)
-    size = min(count, REPLAYED)
+    size = min(count, AT_ONCE)
     thetas, found = tiled(jnp.asarray(source.space.nominal, jnp.float32), size), []
     for first in range(0, count, size):
         index = jnp.minimum(first + jnp.arange(size), count - 1)

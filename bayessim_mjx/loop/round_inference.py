@@ -22,12 +22,13 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import InferenceSettings, calibration, checks, misspecification, rounds
 from bayessim_mjx.inference.calibration import Report
+from bayessim_mjx.inference.numbers import FEW, NEGLIGIBLE
 from bayessim_mjx.inference.range_ends import Pile
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import examination, likelihood_refinement, ranges, set_posterior
 from bayessim_mjx.loop.posterior import condition
-from bayessim_mjx.loop.state import Answer, Evidence, Learnt, Loop, LoopState, Round, joined, slot_of, space_of
-from bayessim_mjx.loop.trajectories import Simulations, at, observe, simulate
+from bayessim_mjx.loop.state import Answer, Evidence, Learnt, Loop, LoopState, Round, space_of
+from bayessim_mjx.loop.trajectories import Simulations, observe, simulate
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.quantities import percent
 from bayessim_mjx.rl import Policy
@@ -38,9 +39,11 @@ __all__ = ["CORRECTIONS", "PREDICTIVE_DRAWS", "infer", "new_network", "score"]
 # share of fresh simulations on which a network's posterior has to be a density. Ant's networks that went on from an
 # older policy's trajectories had .99 of them and more in second rounds (5 runs), .66 to .91 in third ones, whose
 # posteriors were lost. source: docs/decisions/keep_or_replace.md
-SOUND = 0.95
-PREDICTIVE_DRAWS = 64  # thetas of the posterior predictive motion; source: cost alone
-CLIPPED = 0.01  # share of clipped summary entries: more is a warning; source: rule of thumb, not counted
+SOUND = 1 - NEGLIGIBLE
+PREDICTIVE_DRAWS = FEW  # thetas of the posterior predictive motion
+# share of clipped summary entries: no data have more of them beyond so many of their own standard deviations
+# (Chebyshev); these are other data than those of the first fit
+CLIPPED = InferenceSettings.clip**-2
 
 # of the product of the posteriors, in this order: later ones begin with the answer of those before
 CORRECTIONS: tuple[Callable[[Round, Answer], tuple[Answer, Evidence]], ...] = (
@@ -63,13 +66,12 @@ def infer(loop: Loop, state: LoopState, policy: Policy) -> tuple[LoopState, Evid
         answer, corrected = correct(round_, answer)
         found.append(corrected)
     posterior, moves, moved = ranges.move(loop, state, answer.posterior)
-    share, judged = conclude(round_, answer, moves)
-    evidence = joined([*found, describe(round_, answer), moved, judged])
-    domain = checks.guarded(posterior, share)
+    described, domain, judged = describe(round_, answer), *conclude(round_, answer, posterior, moves)
     proposal = rounds.following(posterior, loop.settings.proposal) if loop.sequential else None
+    evidence = sum([*found, described, moved, judged], Evidence())
     state = dataclasses.replace(state, **evidence.kept, domain=domain, proposal=proposal)
     rest = time.perf_counter() - begun - sum(evidence.seconds.values())
-    return state, joined([evidence, Evidence(seconds={"condition": rest})])
+    return state, evidence + Evidence(seconds={"condition": rest})
 
 
 def learn(loop: Loop, state: LoopState, simulations: Simulations) -> tuple[LoopState, Learnt, Evidence]:
@@ -77,16 +79,16 @@ def learn(loop: Loop, state: LoopState, simulations: Simulations) -> tuple[LoopS
     b, known_before = loop.settings, np.asarray(state.fit.identified)
     state, fit, trained = train(loop, state, simulations)
     verdict, checked = check(loop, state, simulations)
-    found = [trained, checked]
+    found = trained + checked
     goes_on = b.checkTrajs and b.ftune and int(state.round)
     if goes_on and lost(verdict and verdict[0], simulations.held[1]):
         warning = "the network of the last round lost its range under this round's policy: fitted anew"
         state, fit, trained = train(loop, state, simulations, anew=True)
         verdict, checked = check(loop, state, simulations)
-        found += [Evidence(warnings=[warning]), trained, checked]
+        found += Evidence(warnings=[warning]) + trained + checked
     widening = b.temperature or (verdict[0].temperature if verdict is not None else None) or 1.0
     state = dataclasses.replace(state, temperature=jnp.float32(widening))
-    return state, Learnt(fit, known_before, verdict), joined(found)
+    return state, Learnt(fit, known_before, verdict), found
 
 
 def lost(report: Report | None, x: Array) -> bool:
@@ -104,7 +106,7 @@ def train(
 ) -> tuple[LoopState, dict[str, Any], Evidence]:
     """Train the network so far or a new one; anew: a new one in any case."""
     clock, b, round_, (thetas, x, count) = time.perf_counter(), loop.settings, int(state.round), simulations.fitted
-    keeps = (b.ftune or round_ == 0) and not ranges.has_moved(state) and not anew
+    keeps = (b.ftune or round_ == 0) and not state.has_moved and not anew
     network = state.fit if keeps else new_network(loop, round_, space_of(loop, state))
     correction: dict[str, Any] = {"again": simulations.again}
     if b.proposal == "apt":
@@ -125,7 +127,7 @@ def check(
     assert loop.source is not None
     known = slice(round_ * b.realTrajs if loop.source.policy_dependent else 0, (round_ + 1) * b.realTrajs)
     # the fresh pairs that test a network were drawn from the same proposal as its round's simulations
-    tilt = state.proposals and at(state.proposals, slot_of(loop, state, round_ + 1)) if b.proposal == "apt" else None
+    tilt = state.proposal if b.proposal == "apt" else None
     key, verdict, warnings = branch(loop.key(round_, "fit"), 2), None, []
     try:
         verdict = checks.examine(
@@ -138,7 +140,7 @@ def check(
 
 
 def new_network(loop: Loop, round_: int, space: ParameterSpace) -> Any:
-    """A fresh FitState for that round, over its ranges."""
+    """Start a fresh FitState for that round, over its ranges."""
     changing = loop.source is not None and loop.source.policy_dependent
     embedding = None if loop.source is None else loop.source.channels.embedding(loop.settings.summarizerFxn)
     settings = InferenceSettings.of(loop.settings, restandardise=changing, embedding=embedding)
@@ -162,16 +164,18 @@ def describe(round_: Round, answer: Answer) -> Evidence:
     return Evidence(fields, score(posterior, truth), warnings)
 
 
-def conclude(round_: Round, answer: Answer, moves: tuple[Pile, ...]) -> tuple[float, Evidence]:
-    """Conclude the checks; return the share of the prior to mix into the randomisation because of misfit."""
+def conclude(
+    round_: Round, answer: Answer, posterior: Distribution, moves: tuple[Pile, ...]
+) -> tuple[Distribution, Evidence]:
+    """Conclude the checks; return `posterior`, with the share of the prior that misfit asks for."""
     verdict, names = round_.learnt.verdict, answer.posterior.names
     if verdict is None:
-        return 0.0, Evidence(warnings=[pile.sentence() for pile in moves])
+        return posterior, Evidence(warnings=[pile.sentence() for pile in moves])
     found = checks.conclude(*verdict, answer.posterior, round_.loop.settings.distrust, moves or None)
     found = dataclasses.replace(found, sets=answer.sets)
     known_already = names if round_.number else _unknown(names, round_.learnt.fit)
     replaced = answer.source in ("replays", "set network")
-    return found.prior_share, Evidence({"checks": found}, warnings=found.warnings(known_already, replaced))
+    return found.guarded(posterior), Evidence({"checks": found}, warnings=found.warnings(known_already, replaced))
 
 
 def complaints(

@@ -21,6 +21,7 @@ from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import product_calibration, restore_prior, set_network
+from bayessim_mjx.inference.numbers import DRAWS
 from bayessim_mjx.inference.product_calibration import Count
 from bayessim_mjx.inference.rounds import REGION
 from bayessim_mjx.inference.temperature import tempered
@@ -32,7 +33,7 @@ from bayessim_mjx.loop.trajectories import features
 from bayessim_mjx.quantities import fixed
 from bayessim_mjx.rl import Policy
 
-FITTED = 2000  # sets that the network is fitted on; source: rule of thumb, other numbers were not measured
+FITTED = DRAWS  # sets that the network is fitted on
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def _learnt(loop: Loop, state: LoopState, policy: Policy, answer: Answer) -> tup
 
 
 def _usable(loop: Loop, state: LoopState, product: Distribution) -> Array:
-    """The real summaries [n, D] that a network of sets can be asked about."""
+    """Select the real summaries [n, D] that a network of sets can be asked about."""
     b, round_ = loop.settings, int(state.round)
     if b.proposal == "division":
         raise UserError("bayessim.proposal=division has no posterior to simulate sets around")

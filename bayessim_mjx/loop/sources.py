@@ -141,7 +141,7 @@ class Surrogate:
         return summarise(self.summarizer, trajectory), trajectory
 
     def repeated(self, first: int, real: Trajectory, thetas: Array) -> dict[str, Array]:
-        """The first of the trajectories `real` replayed at thetas [n, d]: its motion, see `rollout.replay`."""
+        """Replay the first of the trajectories `real` at thetas [n, d]: its motion, see `rollout.replay`."""
         del first
         first_rows = (real.qpos[:, 0], real.qvel[:, 0], real.command)
         qpos0, qvel0, command = (tiled(x[0], len(thetas)) for x in first_rows)
@@ -152,7 +152,7 @@ Source = Surrogate | Recorded
 
 
 def make_source(config: Config, env: Env) -> Source:
-    """The real side that `config` asks for: logs if `real.logs` is set, else the surrogate of `env.realParams`."""
+    """Make the real side that `config` asks for: logs if `real.logs` is set, else the surrogate of `env.realParams`."""
     summarizer = summarizers.get(config.bayessim.summarizerFxn)
     if config.real.logs:
         return recorded(config, env, summarizer)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any, Literal
 
 import flax.struct
@@ -63,6 +62,11 @@ class LoopState:
     standing_gain: Array | None = None  # [] nats
     standing_round: Array | None = None  # [] int32, the round that it comes from, from 1 on; 0: none was judged
 
+    @property
+    def has_moved(self) -> bool:
+        """Whether the network so far is that of other ranges."""
+        return self.moving is not None and not self.moving.space.same(self.fit.space)
+
 
 @dataclasses.dataclass
 class RoundInfo:
@@ -116,20 +120,16 @@ class Evidence:
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     kept: dict[str, Any] = dataclasses.field(default_factory=dict)
 
-
-def joined(found: Sequence[Evidence]) -> Evidence:
-    """Join the evidence of several steps: the last value of a field counts, seconds add up."""
-    whole = Evidence()
-    for one in found:
-        seconds = {name: whole.seconds.get(name, 0.0) + spent for name, spent in one.seconds.items()}
-        whole = Evidence(
-            whole.fields | one.fields,
-            whole.scores | one.scores,
-            [*whole.warnings, *one.warnings],
-            whole.seconds | seconds,
-            whole.kept | one.kept,
+    def __add__(self, later: Evidence) -> Evidence:
+        """Join the evidence of two steps: the later value of a field counts, seconds add up."""
+        seconds = {name: self.seconds.get(name, 0.0) + spent for name, spent in later.seconds.items()}
+        return Evidence(
+            self.fields | later.fields,
+            self.scores | later.scores,
+            [*self.warnings, *later.warnings],
+            self.seconds | seconds,
+            self.kept | later.kept,
         )
-    return whole
 
 
 def chart_of(settings: BayesSimConfig, space: ParameterSpace) -> str:
@@ -204,14 +204,12 @@ class Learnt:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Round:
-    """Inputs of a correction of the posterior."""
+class Situation:
+    """A round once its network is trained."""
 
     loop: Loop
     state: LoopState  # with the round's network, its temperature and all real trajectories so far
     policy: Policy
-    real: Trajectory  # this round's
-    learnt: Learnt
 
     @property
     def number(self) -> int:
@@ -224,6 +222,14 @@ class Round:
         return (self.number + 1) * self.loop.settings.realTrajs
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Round(Situation):
+    """Inputs of a correction of the posterior."""
+
+    real: Trajectory  # this round's
+    learnt: Learnt
+
+
 @dataclasses.dataclass(frozen=True)
 class Answer:
     """A posterior of all real trajectories so far."""
@@ -234,12 +240,12 @@ class Answer:
 
 
 def space_of(loop: Loop, state: LoopState) -> ParameterSpace:
-    """The parameters, with the ranges of the round that comes."""
+    """Return the parameters, with the ranges of the round that comes."""
     return loop.env.space if state.moving is None else state.moving.space
 
 
 def slot_of(loop: Loop, state: LoopState, done: int) -> int:
-    """Slot of the last of `done` rounds among the kept proposals and simulations."""
+    """Find the slot of the last of `done` rounds among the kept proposals and simulations."""
     return (
         (done - 1) % max(1, loop.capacity // loop.settings.trainTrajs)
         if state.moving is None
@@ -248,5 +254,5 @@ def slot_of(loop: Loop, state: LoopState, done: int) -> int:
 
 
 def domain_or_prior(space: ParameterSpace, components: int, chart: str = "plain") -> Distribution | None:
-    """The prior as a distribution with room for `components` Gaussians; None for a task without parameters."""
+    """Make the prior as a distribution with room for `components` Gaussians; None for a task without parameters."""
     return Distribution.prior(space, components, chart) if len(space) else None

@@ -17,17 +17,17 @@ from bayessim_mjx import inference
 from bayessim_mjx.compat import program
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import rounds
+from bayessim_mjx.inference.numbers import DRAWS
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import ranges
 from bayessim_mjx.loop.recorded import Recorded
 from bayessim_mjx.loop.sources import Source
-from bayessim_mjx.loop.state import Evidence, Loop, LoopState, slot_of, space_of
+from bayessim_mjx.loop.state import Evidence, Loop, LoopState, space_of
 from bayessim_mjx.physics.tangent import noisy
 from bayessim_mjx.physics.warp import refuse_overflow
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory
 
-CHUNK = 2500  # trajectories simulated at once while collecting; source: memory alone
 ROOM = 2**27  # bytes that draws of measurement noise may fill
 
 
@@ -43,41 +43,32 @@ class Simulations:
 def simulate(loop: Loop, state: LoopState, policy: Policy) -> tuple[LoopState, Simulations, Evidence]:
     """Simulate trajectories of this round and add them to those kept."""
     clock, b, n = time.perf_counter(), loop.settings, loop.settings.trainTrajs
+    assert loop.source is not None
+    draws, proposal, before = noise_draws(loop), proposal_of(loop, state), state
+
+    def drawn(key: Array, count: int) -> Array:
+        return ranges.completed(loop, before, rounds.draw(key, proposal, b.proposal, count))
+
     # one program for what is fitted and what tests the fit
-    thetas, x, more = simulated(
-        loop.source,  # type: ignore[arg-type]
-        loop.key(int(state.round), "simulate"),
-        policy,
-        proposal_of(loop, state),
-        b.proposal,
-        n + b.checkTrajs,
-        functools.partial(ranges.completed, loop, state),
-        noise_draws(loop),
-    )
-    held, thetas, x, more = (thetas[n:], x[n:]), thetas[:n], x[:n], more[:n]
-    state, row, count = ranges.room(loop, state)
-    if loop.sequential:
-        assert state.proposals is not None and state.proposal is not None
-        slot = slot_of(loop, state, int(state.round) + 1)
-        state = dataclasses.replace(state, proposals=rounds.stored(state.proposals, slot, state.proposal))
+    key = loop.key(int(state.round), "simulate")
+    thetas, x, more = simulated(loop.source, key, policy, drawn, n + b.checkTrajs, draws)
+    held, thetas, x, more, count = (thetas[n:], x[n:]), thetas[:n], x[:n], more[:n], n
+    state, row, kept = ranges.room(loop, state)
     if loop.capacity:
         thetas = jax.lax.dynamic_update_slice(state.thetas, thetas, (row, 0))
         x = jax.lax.dynamic_update_slice(state.features, x, (row, 0))
         state, thetas, x = ranges.mixed(loop, state, thetas, x)
-        state = dataclasses.replace(state, thetas=thetas, features=x)
-        found = Simulations((thetas, x, count), held, _again(more, row, len(thetas)))
-    else:
-        found = Simulations((thetas, x, n), held, _again(more, 0, n))
+        state, count = dataclasses.replace(state, thetas=thetas, features=x), kept
+    if loop.sequential:
+        assert state.proposals is not None and state.proposal is not None
+        state = dataclasses.replace(state, proposals=rounds.stored(state.proposals, row // n, state.proposal))
+    again = None
+    if more.shape[1]:  # the rows of this round are measured more than once
+        place = np.arange(len(thetas), dtype=np.int32) - row
+        again = inference.Again(more, jnp.asarray(np.where((place >= 0) & (place < len(more)), place, -1)))
+    found = Simulations((thetas, x, count), held, again)
     jax.block_until_ready(found.fitted)
     return state, found, Evidence(seconds={"simulate": time.perf_counter() - clock})
-
-
-def _again(more: Array, first: int, rows: int) -> inference.Again | None:
-    """Further draws of the noise of as many rows as there are in `more`, from `first` on."""
-    if not more.shape[1]:
-        return None
-    place = np.arange(rows, dtype=np.int32) - first
-    return inference.Again(more, jnp.asarray(np.where((place >= 0) & (place < len(more)), place, -1)))
 
 
 def observe(loop: Loop, state: LoopState, policy: Policy) -> tuple[LoopState, Trajectory]:
@@ -90,16 +81,9 @@ def observe(loop: Loop, state: LoopState, policy: Policy) -> tuple[LoopState, Tr
 
 
 def simulated(
-    source: Source,
-    key: Array,
-    policy: Policy,
-    proposal: Distribution,
-    method: str,
-    count: int,
-    chosen: Callable[[Array], Array] = lambda thetas: thetas,
-    draws: int = 1,
+    source: Source, key: Array, policy: Policy, drawn: Callable[[Array, int], Array], count: int, draws: int = 1
 ) -> tuple[Array, Array, Array]:
-    """`count` simulated trajectories: theta [count, d], features [count, D], in chunks that fit the memory.
+    """Simulate `count` trajectories: theta [count, d], features [count, D], in chunks that fit the memory.
 
     Third come the features [count, draws - 1, D] of the same trajectories with other draws of the measurement noise.
 
@@ -107,18 +91,16 @@ def simulated(
         source: what simulates.
         key: consumed.
         policy: that acts.
-        proposal, method: what theta is drawn from, see `rounds.draw`.
+        drawn: (key, n) -> theta [n, d].
         count: how many.
-        chosen: the thetas that are simulated in the place of those drawn, as many.
         draws: how often each trajectory is measured.
 
     Raises:
         UserError: contacts had no room (`physics.warp`).
     """
-    chunks = -(-count // CHUNK)
+    chunks = -(-count // DRAWS)
     k_theta, k_roll = jax.random.split(key)
-    thetas = rounds.draw(k_theta, proposal, method, -(-count // chunks) * chunks)
-    thetas = chosen(thetas)
+    thetas = drawn(k_theta, -(-count // chunks) * chunks)
     x, again = _features(source, draws)(k_roll, thetas.reshape(chunks, -1, thetas.shape[-1]), policy)
     _refuse_overflow(source, x, chunks)
     return thetas[:count], x[:count], again[:count]
@@ -132,14 +114,14 @@ def features(source: Source, key: Array, thetas: Array, policy: Policy) -> Array
 
 
 def _refuse_overflow(source: Source, x: Array, chunks: int) -> None:
-    """UserError where all trajectories of a chunk [chunks * n, D] are lost: Warp's contacts had no room."""
+    """Raise a UserError where all trajectories of a chunk [chunks * n, D] are lost: Warp's contacts had no room."""
     if getattr(getattr(source.env, "physics", None), "warp", None) is not None:
         lost = jnp.isnan(x).any(-1).reshape(chunks, -1).all(-1)
         refuse_overflow(lost.mean(), f"the trajectories, simulated {len(x) // chunks} at once")
 
 
 def noise_draws(loop: Loop) -> int:
-    """Number of noise draws of each simulated trajectory: `bayessim.noiseDraws`, or fewer that fit the memory."""
+    """Count the noise draws of each simulated trajectory: `bayessim.noiseDraws`, or fewer that fit the memory."""
     b, source = loop.settings, loop.source
     if source is None or not source.noisy or loop.moves:  # simulations kept lose their order where ranges move
         return 1
@@ -161,7 +143,7 @@ def _features(source: Source, draws: int) -> Callable[[Array, Array, Policy], tu
 
 
 def proposal_of(loop: Loop, state: LoopState) -> Distribution:
-    """The distribution that this round is simulated from."""
+    """Return the distribution that this round is simulated from."""
     if state.proposal is not None:
         return state.proposal
     return Distribution.prior(space_of(loop, state), loop.settings.components)
@@ -182,9 +164,7 @@ def no_motion(loop: Loop, rows: int) -> dict[str, Array] | None:
 
 
 def stored(loop: Loop, state: LoopState, real: Trajectory) -> LoopState:
-    """The state with the measured motion of this round's trajectories: a surrogate's sensors are as noisy as its
-    observations.
-    """
+    """Add the measured motion of this round's trajectories; a surrogate's sensors are as noisy as its observations."""
     if state.motion is None:
         return state
     first, source = int(state.round) * loop.settings.realTrajs, loop.source

@@ -34,7 +34,7 @@ class Watching:
         return f"round {round_ + 1}/{self.loop.settings.realIters}: {part}"
 
     def begin(self, round_: int) -> None:
-        """The training of a round begins."""
+        """Begin the training of a round."""
         self.show(self._of(round_, "training"), 0, self.loop.config.ppo.max_iterations)
 
     def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None:

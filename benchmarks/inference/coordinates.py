@@ -81,7 +81,7 @@ def main() -> None:
         policy = cli.load_policy(path, env, run.config)
     keys = jax.random.split(jax.random.PRNGKey(args.seed), 6)
     n, clock = args.simulations, time.perf_counter()
-    thetas, x, _ = simulated(source, keys[0], policy, Distribution.prior(space), "prior", n + FRESH)
+    thetas, x, _ = simulated(source, keys[0], policy, Distribution.prior(space).sample, n + FRESH)
     at = {
         "prior": thetas[n : n + SETS],
         "truth": jnp.broadcast_to(jnp.asarray(source.truth, jnp.float32), (SETS, len(space))),

@@ -158,7 +158,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args, more = parser.parse_known_args()
     if args.still:
-        local_recalibration.CHANCE = 0.0
+        local_recalibration.ALPHA = 0.0
     own = args.problem == "linear"
     fixed = ["bayessim.collectPolicy=policy_random", "bayessim.refine=off", *more]
     settings = config.load("Pendulum" if own else args.problem, overrides=fixed)

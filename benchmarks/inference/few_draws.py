@@ -1,4 +1,4 @@
-"""How many independent draws a Gaussian of a refined posterior has to stand on (`inference.mixture_fit.FEWEST`).
+"""How many independent draws a Gaussian of a refined posterior has to stand on (`inference.mixture_fit.numbers_of`).
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/inference/few_draws.py --samples 40
 
@@ -72,18 +72,18 @@ def judged(kind: str, seed: int, count: int) -> tuple[float, list[tuple[int, flo
 
 
 def fitted(rng: np.random.Generator, z: np.ndarray, w: np.ndarray, limit: int) -> mixture_fit.Mixture:
-    """`mixture_fit.fitted`, whose number of Gaussians asks for FEWEST as ever and whose check asks for `limit`."""
-    supported, kept = mixture_fit.supported, mixture_fit.FEWEST
+    """`mixture_fit.fitted`, whose check asks for `limit` draws a direction."""
+    supported, kept = mixture_fit.supported, mixture_fit.numbers_of
 
     def check(rng: np.random.Generator, z: np.ndarray, w: np.ndarray, k: int) -> mixture_fit.Mixture:
-        mixture_fit.FEWEST = limit
+        mixture_fit.numbers_of = lambda d: limit * d
         return supported(rng, z, w, k)
 
     try:
         mixture_fit.supported = check
         return mixture_fit.fitted(rng, z, w, MOST)
     finally:
-        mixture_fit.supported, mixture_fit.FEWEST = supported, kept
+        mixture_fit.supported, mixture_fit.numbers_of = supported, kept
 
 
 def main() -> None:

@@ -117,7 +117,7 @@ def rows(seed: int, simulations: int, cases: int, settings: InferenceSettings) -
     for i, (name, real) in enumerate(FAULTS.items()):
         truth, seen = pairs(jax.random.PRNGKey(20_000 + 100 * seed + i), cases, real)
         wall = time.perf_counter()
-        found = misspecification.detect(state, thetas, x, simulations, held, seen)
+        found = misspecification.detect(state, (thetas, x, simulations), held, seen)
         wall = time.perf_counter() - wall
         level = np.asarray(calibration.ranks(jax.random.PRNGKey(3), condition(state, seen), truth).level)
         flagged, by = found.p < misspecification.FLAGGED, np.asarray(moved(truth, real))

@@ -58,7 +58,7 @@ def main() -> None:
         for seed in range(args.first, args.first + args.seeds):
             keys = jax.random.split(jax.random.PRNGKey(seed), 5)
             count = args.simulations + FRESH
-            thetas, x, more = simulated(source, keys[0], None, prior, "prior", count, draws=max(args.draws))
+            thetas, x, more = simulated(source, keys[0], None, prior.sample, count, max(args.draws))
             n, own = args.simulations, jnp.arange(args.simulations, dtype=jnp.int32)
             for draws in args.draws:
                 clock = time.process_time()

@@ -9,6 +9,7 @@ from scipy.special import ndtr
 from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution, charts
 from bayessim_mjx.inference import identify
+from bayessim_mjx.inference.checks import flat_sentences
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 SPACE = ParameterSpace([Parameter("seen", 0.0, -1.0, 1.0), Parameter("unseen", 5.0, 0.0, 10.0)])
@@ -95,7 +96,7 @@ def test_what_a_cut_moves_stays_moved(corr):
 
 
 def test_flat_parameters_are_named():
-    texts = identify.flat_sentences(
+    texts = flat_sentences(
         ("arm mass", "slider mass", "friction"), np.array([0.9, 0.01, 0.6]), np.array([0.8, 0.0, 0.01])
     )
     assert texts[0] == "slider mass: not identified by these trajectories"

@@ -14,7 +14,7 @@ from bayessim_mjx.inference.final_importance_sampling import (
     generalised_pareto,
     smoothed,
 )
-from bayessim_mjx.inference.importance import Refined, refine, sharpened
+from bayessim_mjx.inference.importance import Problem, Refined, refine, sharpened
 from bayessim_mjx.inference.mixture_fit import Mixture
 from bayessim_mjx.inference.smc import ess_of
 from bayessim_mjx.loop.likelihood_refinement import Refinement
@@ -44,7 +44,7 @@ PROPOSALS = {
 @pytest.mark.parametrize("name", PROPOSALS)
 @pytest.mark.slow
 def test_a_linear_gaussian_posterior_is_found_from_wrong_proposals(name):
-    found = refine(PROPOSALS[name], gaussian, seed=3)
+    found = refine(Problem(PROPOSALS[name], gaussian), seed=3)
     assert found.reason is None and found.effective >= 150
     drawn = np.asarray(SPACE.from_unit(found.population.islands.reshape(-1, 3)))
     np.testing.assert_allclose(drawn.mean(0), MEAN, atol=0.25 * SD.min())
@@ -61,7 +61,7 @@ def test_two_modes_are_both_kept():
     def mirrored(theta):
         return norm.logpdf(np.abs(theta[:, 0]), 0.5, 0.02) + norm.logpdf(theta[:, 1:], 0.1, 0.05).sum(1)
 
-    found = refine(Distribution.prior(SPACE), mirrored, draws=2048)
+    found = refine(Problem(Distribution.prior(SPACE), mirrored, draws=2048))
     assert found.reason is None
     left = found.posterior.sample(jnp.asarray([0, 1], jnp.uint32), 2000)[:, 0] < 0
     assert float(left.mean()) == pytest.approx(0.5, abs=0.08)
@@ -71,9 +71,8 @@ def test_two_modes_are_both_kept():
 
 
 def test_a_posterior_at_the_end_of_a_range():
-    found = refine(
-        Distribution.prior(SPACE), lambda t: norm.logpdf(t[:, 0], 1.2, 0.2) + norm.logpdf(t[:, 1:], 0, 0.1).sum(1)
-    )
+    like = lambda t: norm.logpdf(t[:, 0], 1.2, 0.2) + norm.logpdf(t[:, 1:], 0, 0.1).sum(1)  # noqa: E731
+    found = refine(Problem(Distribution.prior(SPACE), like))
     z = np.linspace(-1, 1, 4001)
     weight = norm.pdf(z, 1.2, 0.2)
     assert found.reason is None
@@ -83,9 +82,9 @@ def test_a_posterior_at_the_end_of_a_range():
 def test_what_cannot_be_sampled_keeps_the_proposal_and_says_why():
     prior = PROPOSALS["the prior"]
     rough = np.random.default_rng(0)
-    lottery = refine(prior, lambda t: 400.0 * rough.normal(size=len(t)), rounds=3)
+    lottery = refine(Problem(prior, lambda t: 400.0 * rough.normal(size=len(t)), rounds=3))
     assert lottery.posterior is prior and "can be followed to its power" in lottery.reason
-    nowhere = refine(prior, lambda t: np.full(len(t), np.nan), rounds=3)
+    nowhere = refine(Problem(prior, lambda t: np.full(len(t), np.nan), rounds=3))
     assert nowhere.posterior is prior and nowhere.reason == "none of 3072 simulations has a finite likelihood"
 
 
@@ -108,7 +107,7 @@ def test_where_few_draws_are_possible_the_next_are_drawn_among_them():
         return np.where(np.abs(theta).max(1) < 0.25, gaussian(0 * theta), -np.inf)
 
     with np.errstate(invalid="raise"):
-        found = refine(Distribution.prior(SPACE), hardly, draws=512)
+        found = refine(Problem(Distribution.prior(SPACE), hardly, draws=512))
     assert np.isfinite(found.population.like).all() and found.reason is None
     np.testing.assert_allclose(found.posterior.mean(), 0, atol=0.05)
 
@@ -124,11 +123,8 @@ def test_parameters_times_one_number_leave_a_valley_that_is_followed_to_its_ends
     for seed in range(6):
         truth = rng.uniform(0.5, 2, 3)
         seen = truth[:2] / truth[1:] + 0.005 * rng.normal(size=2)
-        found = refine(
-            Distribution.prior(space),
-            lambda t, seen=seen: -0.5 * ((t[:, :2] / t[:, 1:] - seen) ** 2).sum(1) / 0.005**2,
-            draws=512, seed=seed,
-        )  # fmt: skip
+        like = lambda t, seen=seen: -0.5 * ((t[:, :2] / t[:, 1:] - seen) ** 2).sum(1) / 0.005**2  # noqa: E731
+        found = refine(Problem(Distribution.prior(space), like, draws=512), seed)
         assert found.reason is None
         assert float(found.posterior.log_gain(jnp.asarray(truth))) > 6
         levels.append(float(found.posterior.credible_level(jnp.asarray(truth))))
@@ -142,7 +138,8 @@ def test_seventeen_parameters_of_which_eleven_are_not_seen():
     design, truth = np.zeros((8, 17)), rng.uniform(0.7, 1.8, 17)
     design[:, :6] = rng.normal(size=(8, 6))
     seen = design @ truth + 0.1 * rng.normal(size=8)
-    found = refine(Distribution.prior(space), lambda t: -0.5 * ((t @ design.T - seen) ** 2).sum(1) / 0.1**2, seed=2)
+    like = lambda t: -0.5 * ((t @ design.T - seen) ** 2).sum(1) / 0.1**2  # noqa: E731
+    found = refine(Problem(Distribution.prior(space), like), seed=2)
     assert found.reason is None
     exact = 0.1 * np.sqrt(np.diag(np.linalg.inv(design[:, :6].T @ design[:, :6])))
     np.testing.assert_allclose(found.posterior.sd()[:6], exact, rtol=0.25)
@@ -152,7 +149,7 @@ def test_seventeen_parameters_of_which_eleven_are_not_seen():
 
 def test_a_narrow_posterior_at_a_thousandth_of_its_range():
     centre, sd = np.array([-0.999, 0.5, 0.2]), np.array([1e-6, 1e-4, 1e-2])
-    found = refine(Distribution.prior(SPACE), lambda t: norm.logpdf(t, centre, sd).sum(1), draws=512)
+    found = refine(Problem(Distribution.prior(SPACE), lambda t: norm.logpdf(t, centre, sd).sum(1), draws=512))
     assert found.reason is None
     drawn = found.population.islands.reshape(-1, 3) * 2 - 1
     np.testing.assert_allclose(drawn.std(0), sd, rtol=0.2)
@@ -183,8 +180,9 @@ def test_independent_draws_bring_the_regions_nearer_to_what_they_say():
             return -0.5 * ((t[:, :2] / t[:, 1:] - seen) ** 2).sum(1) / 0.005**2
 
         prior = Distribution.prior(space)
-        found = refine(prior, like, draws=512, seed=seed)
-        better = sharpened(found, prior, like, draws=512, seed=seed)
+        problem = Problem(prior, like, draws=512)
+        found = refine(problem, seed)
+        better = sharpened(problem, found, seed=seed)
         assert better.effective > 2000 > found.effective
         draws = jnp.asarray(valley(rng, seen, 0.005, 2000), jnp.float32)
         gained.append(float(jnp.mean(better.posterior.log_prob(draws) - found.posterior.log_prob(draws))))

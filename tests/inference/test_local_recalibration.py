@@ -64,7 +64,7 @@ def test_a_mean_error_is_what_is_beyond_chance_and_few_sets_tell_none():
     move, cov = local_recalibration.mean_error(errors[0] + np.array([3.0, 0, 0, 0, 0]))
     np.testing.assert_allclose(move, [3.0, 0, 0, 0, 0], atol=0.45)
     np.testing.assert_allclose(cov, np.eye(5), atol=0.6)
-    assert local_recalibration.mean_error(errors[0, :8] + 3.0)[0] is None
+    assert local_recalibration.mean_error(errors[0, :5] + 3.0)[0] is None
 
 
 def test_nothing_is_moved_out_of_the_box():
@@ -78,7 +78,7 @@ def test_parameters_that_are_not_identified_keep_no_other_from_being_moved():
     space = ParameterSpace([Parameter(f"t{i}", 0.0, -1.0, 1.0) for i in range(13)])
     scale = np.diag([0.05] + [20.0] * 12)[None]
     q = Distribution.from_unit(space, np.zeros(1), np.full((1, 13), 0.5), scale)
-    assert float(q.log_inside) < 1.3 * product_calibration.BEYOND
+    assert float(q.log_inside) < 1.3 * product_calibration.ROUNDED
     np.testing.assert_allclose(
         product_calibration.moved(q, np.array([0.2] + [0.0] * 12)).means[0, :2], [0.7, 0.5], rtol=1e-6
     )
@@ -108,13 +108,13 @@ def test_turns_that_end_without_an_answer_say_so(monkeypatch):
     product = Distribution.from_unit(SPACE, np.zeros(1), np.full((1, 2), 0.5), 0.05 * np.eye(2)[None])
     never = [replace(found.counts[0], widening=2.0 + k) for k in range(local_recalibration.TURNS)]
     turns = iter(never)
-    monkeypatch.setattr(local_recalibration, "judged", lambda *a: (next(turns), None, 0.0))
+    monkeypatch.setattr(local_recalibration, "judged", lambda *a: (next(turns), None, True))
     here = local_recalibration.recalibrated(
         found, product, lambda posterior, turn: ([], np.zeros((0, 2))), components=1
     )
     assert not here.settled and "still asked for more" in here.sentence() and here.to_dict()["settled"] is False
     assert here.widening(2) == local_recalibration.TURNS + 1
-    monkeypatch.setattr(local_recalibration, "judged", lambda *a: (found.counts[0], None, 0.0))
+    monkeypatch.setattr(local_recalibration, "judged", lambda *a: (found.counts[0], None, True))
     assert local_recalibration.recalibrated(
         found, product, lambda posterior, turn: ([], np.zeros((0, 2))), components=1
     ).settled

@@ -9,7 +9,7 @@ from scipy.stats import kstest
 from bayessim_mjx import inference
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference import checks, misspecification
-from bayessim_mjx.inference.misspecification import Scores, ranked
+from bayessim_mjx.inference.misspecification import Misfit, Scores, ranked
 from bayessim_mjx.inference.range_ends import piles
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
@@ -35,7 +35,7 @@ def detector():
     state = inference.init(jax.random.PRNGKey(1), settings, SPACE, x.shape[1])
     state, _ = inference.fit(jax.random.PRNGKey(2), state, thetas, x)
     held = simulate(3, 400)[1]
-    return lambda real: misspecification.detect(state, thetas, x, 3000, held, real)
+    return lambda real: misspecification.detect(state, (thetas, x, 3000), held, real)
 
 
 def test_nothing_is_flagged_where_nothing_is_wrong(detector):
@@ -84,10 +84,13 @@ def test_the_combination_of_p_values():
 
 
 def test_distrust_mixes_the_prior_in():
-    assert misspecification.prior_share(0.05, 0.5) == 0 and misspecification.prior_share(0.3, 0.5) == 0
-    assert misspecification.prior_share(0.01, 0.5) == pytest.approx(0.4)
+    one = np.zeros((1, 3))
+    sound, above, odd = (Misfit(np.array([p]), one, one, one, one, 99) for p in (0.05, 0.3, 0.01))
+    assert sound.prior_share(0.5) == pytest.approx(0, abs=1e-9) and above.prior_share(0.5) == 0
+    assert odd.prior_share(0.5) == pytest.approx(0.4)
     q = Distribution.gaussian(SPACE, [1.0, 1.0], 0.05)
-    mixed, theta = checks.guarded(q, 0.4), jnp.asarray([[1.0, 1.0], [1.9, 0.3]])
+    found, theta = checks.Checks(None, odd, (), (), odd.prior_share(0.5)), jnp.asarray([[1.0, 1.0], [1.9, 0.3]])
+    mixed = found.guarded(q)
     expected = 0.6 * np.exp(q.log_gain(theta)) + 0.4
     np.testing.assert_allclose(np.exp(mixed.log_gain(theta)), expected, rtol=1e-4)
 

@@ -105,7 +105,7 @@ def test_proposals_of_all_methods():
     one = proposal_of(q, "division")
     assert one.components == 1 and float(one.prior_weight) == 0.0
     np.testing.assert_allclose(one.mean(), q.mean(), atol=0.02)
-    assert float(proposal_of(q, "apt").prior_weight) == pytest.approx(0.05)
+    assert float(proposal_of(q, "apt").prior_weight) == pytest.approx(0.1)
     both = stack([q, one])
     assert both.logits.shape == (2, 8 if both.components == 8 else 3)
     np.testing.assert_allclose(both.split()[1].log_gain(jnp.zeros(2)), one.log_gain(jnp.zeros(2)), atol=1e-3)

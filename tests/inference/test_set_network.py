@@ -24,8 +24,8 @@ def test_draws_fill_the_ellipsoid_around_a_posterior():
     assert np.allclose(mean, [0.4, 0.6], atol=2e-3) and float(jnp.linalg.norm(y, axis=1).max()) <= 1.0
     # of a ball that is filled evenly in two dimensions the variance is 1 / 4 each
     assert np.allclose(np.cov(np.asarray(y).T), np.eye(2) / 4, atol=0.02)
-    # twice as wide as the ellipse of all but 1e-3 of a Gaussian
-    assert np.allclose(np.diagonal(scale), 2 * np.sqrt(-2 * np.log(1e-3)) * np.array([0.02, 0.01]), rtol=0.1)
+    # as wide as the ellipse of all but 1.2e-7 of a Gaussian
+    assert np.allclose(np.diagonal(scale), np.sqrt(-2 * np.log(2.0**-23)) * np.array([0.02, 0.01]), rtol=0.1)
 
 
 def test_draws_stay_in_the_ranges_and_are_even_there():

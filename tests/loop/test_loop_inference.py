@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.loop import examination
+from bayessim_mjx.loop.state import Situation
 from tests.loop.stub_source import FITTED, NOISE, NORMAL, SPACE, infer, made
 
 
@@ -125,9 +126,8 @@ def test_products_of_several_trajectories_are_judged_and_widened():
         assert info.scores[f"sets/coverage_{100 * level:.0f}"] == pytest.approx(level, abs=0.2)
     assert last.gain >= last.plain - 0.1 and info.sets.near
     assert float(state.domain.sd()[0]) > 0.9 * NOISE / 4**0.5  # never surer than the exact posterior
-    again = examination.rejudge(
-        parts, dataclasses.replace(state, round=state.round - 1), None, 4, jax.random.PRNGKey(1), 2
-    )  # as the command `calibrate` asks for it
+    now = Situation(parts, dataclasses.replace(state, round=state.round - 1), None)
+    again = examination.rejudge(now, jax.random.PRNGKey(1), 2)  # as the command `calibrate` asks for it
     # as the round used it
     assert [c.widening for c in again.counts] == [info.sets.widening(c.trajectories) for c in info.sets.counts]
     assert again.near[0].widening == info.sets.widening(4) and (again.move is None) == (info.sets.move is None)
@@ -139,4 +139,4 @@ def test_products_of_several_trajectories_are_judged_and_widened():
 
 def test_a_single_trajectory_needs_no_set():
     parts, state = made("bayessim.checkTrajs=40", "bayessim.realTrajs=1")
-    assert examination.judge(parts, state, None, 1) is None
+    assert examination.judge(Situation(parts, state, None)) is None

@@ -10,7 +10,7 @@ import pytest
 from bayessim_mjx import config, loop
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference.importance import Refined
+from bayessim_mjx.inference.importance import Problem, Refined
 from bayessim_mjx.loop import likelihood_refinement, outer_loop, round_inference
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -148,7 +148,9 @@ def test_moves_that_do_not_reach_the_wider_posterior_do_not_throw_the_refined_on
     monkeypatch.setattr(likelihood_refinement.importance, "tempered", lambda *a, **k: short)
     monkeypatch.setattr(likelihood_refinement, "_spread", lambda *a: (np.array([[4.0]]), np.eye(1)))
     likelihood = SimpleNamespace(squares=lambda thetas: thetas)
-    wide, factor = likelihood_refinement._adjusted(found, Distribution.prior(space), likelihood, lambda t: t, 8, 0)
+    wide, factor = likelihood_refinement._adjusted(
+        found, Problem(Distribution.prior(space), lambda t: t), likelihood, 0
+    )
     assert factor == pytest.approx(2.0) and wide.reason is None and wide.simulations == 50_000
     assert np.asarray(wide.posterior.scales)[:, 0, 0] == pytest.approx(0.04)
     assert np.asarray(wide.posterior.means) == pytest.approx(np.asarray(two.means))

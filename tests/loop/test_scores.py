@@ -12,7 +12,7 @@ from bayessim_mjx.inference.product_calibration import stacked
 from bayessim_mjx.loop import outer_loop, posterior
 from bayessim_mjx.loop.likelihood import Likelihood
 from bayessim_mjx.loop.likelihood_refinement import _spread
-from bayessim_mjx.loop.state import Evidence, joined
+from bayessim_mjx.loop.state import Evidence
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 
 
@@ -79,4 +79,4 @@ def test_evidence_of_steps_adds_up_in_their_order() -> None:
     second = Evidence({"fit": 5}, {"b": 2.0, "a": 3.0}, ["two"], {"fit": 6.0, "check": 1.0})
     fields, scores = {"fit": 5, "sets": 2}, {"a": 3.0, "b": 2.0}
     expected = Evidence(fields, scores, ["one", "two"], {"fit": 9.0, "check": 1.0}, {"standing": 4})
-    assert joined([first, second]) == expected and joined([]) == Evidence()
+    assert first + second == expected and first + Evidence() == Evidence() + first == first

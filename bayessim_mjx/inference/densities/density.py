@@ -63,12 +63,12 @@ def register(density: Density) -> Density:
 
 
 def density_of(settings: InferenceSettings) -> Density:
-    """The density that settings.modelClass names."""
+    """Find the density that settings.modelClass names."""
     return DENSITIES.entry(settings.density[0])
 
 
 def started(key: Array, settings: InferenceSettings, dim_x: int) -> tuple[Params, tuple[int, ...]]:
-    """A density's `start`, its answer checked.
+    """Call a density's `start` and check its answer.
 
     Raises:
         UserError: where its parameters or widths cannot be used.

@@ -16,11 +16,11 @@ from scipy.stats import qmc
 
 from bayessim_mjx.config.names import kernel_of
 from bayessim_mjx.inference.densities.density import Density, Drop, Params, register
+from bayessim_mjx.inference.numbers import FEW
 from bayessim_mjx.inference.settings import InferenceSettings
 from bayessim_mjx.linalg import REGRESSED, product, ridge
 
 NU = {"RBF": np.inf, "Laplace": 0.5, "Matern12": 0.5, "Matern32": 1.5, "Matern52": 2.5}
-PAIRED = 512  # rows behind the median heuristic; source: cost alone
 # bandwidths tried by validation, in median distances; source: rule of thumb, not counted
 MULTIPLES = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 
@@ -62,7 +62,7 @@ def fourier(x: Array, omega: Array, rate: Array) -> Array:
 
 def median_distance(x: Array, use: Array) -> Array:
     """Median distance between the first rows of x [n, D] with use [n] (bool)."""
-    rows = jnp.argsort(~use)[:PAIRED]
+    rows = jnp.argsort(~use)[:FEW]
     x, use = x[rows], use[rows]
     squares = jnp.sum(x * x, axis=1)
     squared = squares[:, None] + squares[None, :] - 2 * product(x, x.T)

@@ -21,7 +21,7 @@ def names() -> list[str]:
 
 
 def entry(name: str, key: str = "summarizer") -> tuple[Summary, dict[str, Any]]:
-    """The summary that a setting names, and the option that a number at the end of the name sets.
+    """Find the summary that a setting names, and the option that a number at the end of the name sets.
 
     Raises:
         UserError: naming the value, where it came from (`key`) and the summaries that there are.

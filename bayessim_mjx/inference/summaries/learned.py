@@ -51,7 +51,7 @@ class _Network(nn.Module):
 
 
 def _windows(x: Array, window: int) -> Array:
-    """The `window` rows around each row of x [..., T, C], zeros beyond the ends -> [..., T, window C]."""
+    """Join the `window` rows around each row of x [..., T, C], zeros beyond the ends -> [..., T, window C]."""
     steps, before = x.shape[-2], (window - 1) // 2
     x = jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(before, window - 1 - before), (0, 0)])
     return jnp.concatenate([x[..., i : i + steps, :] for i in range(window)], axis=-1)
@@ -68,12 +68,12 @@ class Embedding:
     state_size: int  # S
     action_size: int  # A
     features: int = 32  # learned features F, without context
-    width: int = 64  # channels of the two convolutions
+    width: int = 0  # channels of the two convolutions; 0: as many as the dense layer has units
     window: int = 5
 
     def __post_init__(self) -> None:
         for name in ("steps", "state_size", "action_size", "features", "width", "window"):
-            low = 0 if name == "action_size" else 1
+            low = 0 if name in ("action_size", "width") else 1
             if getattr(self, name) < low:
                 raise UserError(f"embedding: {name} = {getattr(self, name)}: must be at least {low}")
         if self.window > self.steps:
@@ -129,7 +129,7 @@ class Embedding:
 
     @property
     def _network(self) -> _Network:
-        return _Network(self.width, self.window, self.features)
+        return _Network(self.width or 2 * self.features, self.window, self.features)
 
     def _inputs(self, rows: Array) -> tuple[Array, Array, Array]:
         states, changes, actions, valid, context = self.unpack(rows)
@@ -155,7 +155,7 @@ def _moments(x: Array, weights: Array) -> tuple[Array, Array]:
 
 
 def summary_learned(states: Array, actions: Array, valid: Array | None = None) -> Array:
-    """The trajectory itself for a network that learns its features -> [(2 T + 1) S + T A + T].
+    """Return the trajectory itself for a network that learns its features -> [(2 T + 1) S + T A + T].
 
     states, their changes s_{t+1} - s_t, actions, valid. Changes have a scale of their own, small beside the states'.
     """

@@ -42,7 +42,7 @@ def summary_waypts(states: Array, actions: Array, valid: Array | None = None, wa
 
 
 def waypoint_times(steps: int, waypoints: int | None = None) -> np.ndarray:
-    """The rows of the waypoints in a trajectory of `steps` actions."""
+    """Place the waypoints in a trajectory of `steps` actions."""
     count = min(10, steps + 1) if waypoints is None else waypoints
     if not 1 <= count <= steps + 1:
         raise UserError(f"summary_waypts: waypoints = {count}: {steps} steps have 1 to {steps + 1} states")

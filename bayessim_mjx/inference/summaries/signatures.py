@@ -19,7 +19,6 @@ from jax import Array
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.summaries.summary import MAX_FEATURES, Stream, Summary, affordable, held, register
 
-MOST_BY_DEFAULT = 12100  # BayesSimIG's limit n^depth <= 110^2 of the depth that it takes; source: its code
 DEPTH = 3  # of a signature by default; source: BayesSimIG
 Levels = tuple[Array, ...]
 
@@ -38,7 +37,7 @@ def log_size(channels: int, depth: int) -> int:
 
 
 def identity(channels: int, depth: int) -> Levels:
-    """The signature of a path that stands still."""
+    """Return the signature of a path that stands still."""
     return tuple(jnp.zeros(channels**k) for k in range(1, depth + 1))
 
 
@@ -74,7 +73,7 @@ def signature(increments: Array, depth: int) -> Levels:
 
 
 def signature_tree(increments: Array, depth: int) -> Levels:
-    """The same as a balanced tree of Chen products: depth log2 T, memory of T signatures."""
+    """Compute the same by a balanced tree of Chen products: depth log2 T, memory of T signatures."""
     steps = increments.shape[0]
     padding = (1 << max(steps - 1, 0).bit_length()) - steps  # standing still at the end changes nothing
     levels = exp(jnp.pad(increments, ((0, padding), (0, 0))), depth)
@@ -93,7 +92,7 @@ def log(a: Levels) -> Levels:
 
 
 def lyndon(levels: Levels) -> Levels:
-    """The entries at Lyndon words, coordinates of a Lie element: nothing is lost, and none depends on the others."""
+    """Select the entries at Lyndon words, coordinates of a Lie element: none is lost, or depends on the others."""
     where = lyndon_words(levels[0].shape[-1], len(levels))
     return tuple(a[..., index] for a, index in zip(levels, where, strict=True))
 
@@ -123,7 +122,7 @@ def _outer(a: Array, b: Array) -> Array:
 
 
 def _nilpotent(a: Levels, b: Levels) -> Levels:
-    """(a - 1)(b - 1): level k is the sum of a_i b_{k-i}."""
+    """Compute (a - 1)(b - 1): level k is the sum of a_i b_{k-i}."""
     return (jnp.zeros_like(a[0]),) + tuple(
         reduce(jnp.add, [_outer(a[i - 1], b[k - i - 1]) for i in range(1, k)]) for k in range(2, len(a) + 1)
     )
@@ -139,13 +138,13 @@ class _Kind(NamedTuple):
     shorter: tuple[_Kind, ...] = ()  # kinds with fewer features
 
     def depth(self, channels: int, depth: int | None = None) -> int:
-        """`depth`, or by default 3, or 2 where channels^3 > 110^2 (BayesSimIG's rule, which went on to a useless 1).
+        """Check a depth; by default 3, or 2 where that has more than MAX_FEATURES features.
 
         Raises:
             UserError: where that depth gives more than MAX_FEATURES features, naming the depths that do not.
         """
         if depth is None:
-            depth = DEPTH if channels**DEPTH <= MOST_BY_DEFAULT else 2
+            depth = DEPTH if self.size(channels, DEPTH) <= MAX_FEATURES else DEPTH - 1
         if depth < 1:
             raise UserError(f"{self.name}: depth = {depth}: must be at least 1")
         if (features := self.size(channels, depth)) > MAX_FEATURES:
@@ -177,7 +176,7 @@ def summary_signatory(
 def summary_logsignature(
     states: Array, actions: Array, valid: Array | None = None, depth: int | None = None, parallel: bool = False
 ) -> Array:
-    """The logarithm of summary_signatory at Lyndon words: the same information in fewer numbers -> [sum of Witt's].
+    """Take summary_signatory's logarithm at Lyndon words: the same information in fewer numbers -> [sum of Witt's].
 
     Level k has (1/k) sum_{d | k} mu(k/d) n^d entries: n, n(n-1)/2, (n^3-n)/3, ...
     """
@@ -193,7 +192,7 @@ def _features(
 
 
 def path_increments(states: Array, actions: Array) -> Array:
-    """Steps [2 T + 1, 1 + S + A] of the path (time, state, action) from 0: actions jump, then time and state move."""
+    """Make the steps [2 T + 1, 1 + S + A] of the path (time, state, action): actions jump, then time and state move."""
     (steps, a), s = actions.shape, states.shape[1]
     jumps = jnp.diff(actions, axis=0, prepend=jnp.zeros((1, a)))
     jumps = jnp.concatenate([jnp.zeros((steps, 1 + s)), jumps], axis=1)
@@ -210,7 +209,7 @@ def base_increment(state: Array, action_size: int) -> Array:
 def _names(
     kind: _Kind, steps: int, states: Sequence[str], actions: Sequence[str], depth: int | None = None
 ) -> list[str]:
-    """Iterated integrals by the channels they run over; those of a logarithm as nested areas, by their Lyndon words."""
+    """Name iterated integrals by the channels they run over; those of a logarithm, nested areas, by Lyndon words."""
     channels = ["time", *states, *actions]
     depth = kind.depth(len(channels), depth)
     levels = [list(itertools.product(channels, repeat=k)) for k in range(1, depth + 1)]

@@ -61,7 +61,7 @@ def register(summary: Summary) -> Summary:
 
 
 def held(states: Array, actions: Array, valid: Array | None = None) -> tuple[Array, Array]:
-    """The trajectory with every row after the end of the episode replaced by the last one before it."""
+    """Replace every row after the end of the episode by the last one before it."""
     if states.ndim != 2 or actions.ndim != 2 or states.shape[0] != actions.shape[0] + 1 or actions.shape[0] < 1:
         raise UserError(f"need states [T+1, S] and actions [T, A], T >= 1, not {states.shape} and {actions.shape}")
     if valid is None:
