@@ -16,13 +16,13 @@ import yaml
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import units
 from bayessim_mjx.logs.check import needed_columns
+from bayessim_mjx.logs.csv_files import form_of
 from bayessim_mjx.logs.files import SUFFIXES, map_of_folder
 from bayessim_mjx.logs.log import Array, Channels
 from bayessim_mjx.logs.mapping import LogMap, Source
 from bayessim_mjx.logs.pieces import MAX_GAP, SHORT_GAP
 from bayessim_mjx.logs.proposal import Proposal, native, propose
 from bayessim_mjx.logs.read import read_logs, table_of
-from bayessim_mjx.logs.sniffing import form_of
 from bayessim_mjx.logs.table import Table
 
 HEAD = """# Proposed from the names of the columns; look through it, and edit it (docs/logs.md).

@@ -13,11 +13,10 @@ import numpy as np
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.absent import filled
-from bayessim_mjx.logs.bad_rows import leave_out
+from bayessim_mjx.logs.bad_rows import leave_out, without_copies
 from bayessim_mjx.logs.check import STREAMS, check_finite, check_motion, check_names, check_time
 from bayessim_mjx.logs.csv_files import read_csv
 from bayessim_mjx.logs.doubts import check_units
-from bayessim_mjx.logs.duplicates import without_copies
 from bayessim_mjx.logs.files import FORMAT, Paths, distinct, files_of, map_of_folder, side_yaml
 from bayessim_mjx.logs.jitter import say_better_clock
 from bayessim_mjx.logs.jsonl import read_jsonl

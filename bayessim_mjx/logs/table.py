@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import instants
 from bayessim_mjx.logs.log import Array
-from bayessim_mjx.logs.numerals import Marks
+from bayessim_mjx.logs.texts import Marks
 
 _WORDS = {"true": 1.0, "yes": 1.0, "on": 1.0, "false": 0.0, "no": 0.0, "off": 0.0, "": float("nan")}
 _COMMAS = Marks(",")

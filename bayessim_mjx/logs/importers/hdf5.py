@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.importers.arrays import numbered, recording
 from bayessim_mjx.logs.importers.needs import needs
-from bayessim_mjx.logs.importers.streams import Recording
+from bayessim_mjx.logs.importers.streams import Recording, numbered, recording
 
 WHAT = ("positions", "commands", "velocities", "efforts", "time")
 USUAL = {  # of ALOHA's files

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.importers.arrays import numbered, recording
 from bayessim_mjx.logs.importers.needs import needs
-from bayessim_mjx.logs.importers.streams import Recording
+from bayessim_mjx.logs.importers.streams import Recording, numbered, recording
 from bayessim_mjx.logs.log import Array
 
 STATE, ACTION = "observation.state", "action"

@@ -1,4 +1,4 @@
-"""Signals with time stamps of their own, brought onto one clock."""
+"""Signals with time stamps of their own, or arrays of one sampling, brought onto one clock."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.commands import integrals
 from bayessim_mjx.logs.log import Array
 from bayessim_mjx.logs.pieces import MAX_GAP
+from bayessim_mjx.logs.resample import integrals
 
 
 @dataclass(frozen=True)
@@ -101,3 +101,34 @@ class Recording:
         """From when to when each signal was recorded."""
         spans = {**self.positions, **{f"command {name}": stream for name, stream in self.commands.items()}}
         return ", ".join(f"{name} {s.time.min():.3f} to {s.time.max():.3f} s" for name, s in spans.items())
+
+
+def recording(
+    name: str, time: Array, arrays: Mapping[str, Array], names: Mapping[str, Sequence[str]], notes: Sequence[str] = ()
+) -> Recording:
+    """The recording of arrays `positions`, `commands` [T, n] and, where there are some, `velocities` and `efforts`.
+
+    Args:
+        name: of the run.
+        time: [T], s.
+        arrays: by what they are.
+        names: of the columns of each.
+        notes: what the user should know.
+
+    Raises:
+        UserError: another number of rows or columns than times or names.
+    """
+    streams: dict[str, dict[str, Stream]] = {}
+    for what, values in arrays.items():
+        table = np.asarray(values, float).reshape(len(values), -1)
+        if table.shape != (len(time), len(names[what])):
+            allowed = f"allowed: {len(time)} rows, as many as times, of {', '.join(names[what])}"
+            raise UserError(f"{name}: {what} of shape {np.shape(values)}; {allowed}")
+        kind = "held" if what == "commands" else "measured"
+        streams[what] = {j: Stream(time, c, kind) for j, c in zip(names[what], table.T, strict=True)}  # type: ignore[arg-type]
+    return Recording(name, **streams, notes=notes)  # type: ignore[arg-type]
+
+
+def numbered(given: Sequence[str] | None, count: int) -> list[str]:
+    """Names of `count` columns: those given where they are as many, else `joint0`, `joint1` ..."""
+    return list(given) if given is not None and len(given) == count else [f"joint{i}" for i in range(count)]
