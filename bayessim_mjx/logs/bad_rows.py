@@ -71,6 +71,25 @@ def _tell(
     warnings.warn(f"{table.path}: bad_rows: {policy}: {'; '.join(texts)}", stacklevel=4)
 
 
+def oldest_first(table: Table, columns: dict[str, Array]) -> tuple[Table, dict[str, Array]]:
+    """Table and columns [T] with the rows in the order of time, where they stand newest first, with a warning."""
+    steps = np.diff(columns["time"])
+    seen = steps[np.isfinite(steps)]
+    if not len(seen) or not ((seen <= 0).all() and (seen < 0).any()):
+        return table, columns
+    last = table.rows - 1
+    warnings.warn(
+        f"{table.path}: the rows stand newest row first; they are read from the last to the first", stacklevel=4
+    )
+    changed = dataclasses.replace(
+        table,
+        columns={name: column[::-1] for name, column in table.columns.items()},
+        ragged={last - row: why for row, why in table.ragged.items()},
+        kept=[table.row(row) for row in range(last, -1, -1)],
+    )
+    return changed, {name: column[::-1] for name, column in columns.items()}
+
+
 def without_copies(table: Table, columns: dict[str, Array]) -> tuple[Table, dict[str, Array]]:
     """Table and columns [T] without rows that repeat the row before them, with a warning that counts them.
 

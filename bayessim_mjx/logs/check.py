@@ -81,6 +81,8 @@ def _mend_of(time: Array) -> str:
         rate = round((len(time) - 1) / max(float(time[-1] - time[0]), 1e-9), 3)
         text = f"; the stamps are {grain:g} s apart and many rows share each, about {rate:g} rows per second"
         return f"{text}: `time: {{column: ..., rate: ROWS_PER_SECOND}}` in a map spaces them evenly"
+    if len(time) and (time == time[0]).all():
+        return "; the stamps stand still, as where a program rounded them: `rate: ROWS_PER_SECOND` in place of `time`"
     lost = float(np.mean(time < np.maximum.accumulate(time)))
     if lost > 0.05:
         return f"; a clock that begins anew ({percent(lost)} of the rows come after it): cut the file there into two"

@@ -52,7 +52,7 @@ def read_csv(path: Path, form: Form = Form()) -> Table:  # noqa: B008  # immutab
     text, skipped = (text[1:], 1) if own else (text, form.skip_rows)
     delimiter = own or form.delimiter
     try:
-        lines = list(csv.reader(text, delimiter=delimiter))
+        lines = list(csv.reader(text, delimiter=delimiter, skipinitialspace=not delimiter.isspace()))
     except csv.Error as error:
         raise UserError(f"{path}: not a text file ({error}); {ALLOWED}") from None
     if delimiter == " ":
@@ -60,6 +60,8 @@ def read_csv(path: Path, form: Form = Form()) -> Table:  # noqa: B008  # immutab
     while lines and not any(f.strip() for f in lines[-1]):
         lines.pop()
     body = lines[1 + form.skip_after_header :] if form.header else lines[form.skip_after_header :]
+    kept = [row for row, fields in enumerate(body) if any(f.strip() for f in fields) or len(fields) == len(lines[0])]
+    body = [body[row] for row in kept]  # lines that hold nothing at all are no rows
     if not body:
         raise UserError(f"{path}: no data rows; allowed: a header line and one row per sample")
     names = [f.strip().lstrip("#").strip() for f in lines[0]] if form.header else [str(i) for i in range(len(body[0]))]
@@ -76,16 +78,16 @@ def read_csv(path: Path, form: Form = Form()) -> Table:  # noqa: B008  # immutab
     ragged = {row: f"{len(fields)} fields" for row, fields in enumerate(body) if len(fields) != len(names)}
     if ragged and not form.lenient:
         row = min(ragged)
-        at = f"{path}: line {row + first} has {ragged[row]}; allowed: {len(names)} ({', '.join(names)})"
+        at = f"{path}: line {kept[row] + first} has {ragged[row]}; allowed: {len(names)} ({', '.join(names)})"
         raise UserError(at + _why_ragged(text, body, names, delimiter, ragged))
     if form.header and not form.lenient:
-        _units_row(path, body, first)
+        _units_row(path, body, first + kept[0])
     body = [[""] * len(names) if row in ragged else fields for row, fields in enumerate(body)]
     marks = marks_of(body, form.decimal, form.thousands)
     columns = {name: [r[i] for r in body] for i, name in enumerate(names)}
     blank = {names[i] for i in unnamed if not any(r[i].strip() for r in body)}
     columns = {name: column for name, column in columns.items() if name not in blank}
-    return Table(path, columns, first, lenient=form.lenient, ragged=ragged, marks=marks)
+    return Table(path, columns, first, lenient=form.lenient, ragged=ragged, marks=marks, kept=kept)
 
 
 def _in_blanks(text: Sequence[str], lines: list[list[str]]) -> list[list[str]]:

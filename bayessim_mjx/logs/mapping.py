@@ -13,6 +13,7 @@ from bayessim_mjx.config import read_yaml
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import stamps
 from bayessim_mjx.logs.csv_files import Form
+from bayessim_mjx.logs.instants import MEND
 from bayessim_mjx.logs.log import Array, suggest
 from bayessim_mjx.logs.map_keys import plain, source_keys
 from bayessim_mjx.logs.table import Table
@@ -165,14 +166,20 @@ class Clock(Source):
         return raw if self.rate is None else stamps.even(raw, self.rate, table, name)
 
     def _numbers(self, table: Table, name: str, where: str) -> Array:
-        raw = self.decoded(table.numbers(name), table, name)
+        try:
+            raw = table.numbers(name, self.suffix)
+        except UserError as error:
+            raise UserError(f"{error}{MEND}") from None
+        if self.wrap is None:
+            stamps.check_counter(raw, table, name)
+        raw = self.decoded(raw, table, name)
         if self.nanoseconds is not None:
             more = table.numbers(column_of(table, self.nanoseconds, where))
             return self.factors()[0] * raw + 1e-9 * more + self.offset
         if self.stated:
             scale, offset = self.factors()
             return scale * (raw - self.zero) + offset
-        return stamps.seconds_of(raw, table, name) + self.offset
+        return stamps.seconds_of(raw, table, name, self.suffix) + self.offset
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.absent import filled
-from bayessim_mjx.logs.bad_rows import leave_out, without_copies
+from bayessim_mjx.logs.bad_rows import leave_out, oldest_first, without_copies
 from bayessim_mjx.logs.check import STREAMS, check_finite, check_motion, check_names, check_time
 from bayessim_mjx.logs.csv_files import read_csv
 from bayessim_mjx.logs.doubts import check_units
@@ -83,6 +83,7 @@ def _read_one(
         columns, sources = _columns(table, channels, log_map)
     columns, absent = filled(table, columns, channels, mj_model) if partial else (columns, ())
     check_names(table, columns, channels)
+    table, columns = oldest_first(table, columns)
     if table.lenient:
         table, columns = leave_out(table, columns, sources, channels, log_map.bad_rows)
     table, columns = without_copies(table, columns)

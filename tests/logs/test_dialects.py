@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from dialects import SERVO, TRUTH, Case, text
+from dialects_of_habits import CASES as HABITS
 from dialects_of_texts import CASES as TEXTS
 from dialects_of_times import CASES as TIMES
 from dialects_of_units import CASES as UNITS
@@ -17,7 +18,7 @@ from log_files import ARM, HEADER
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Log, LogMap, read_logs
 
-CASES = {case.name: case for case in (*TEXTS, *TIMES, *UNITS)}
+CASES = {case.name: case for case in (*TEXTS, *TIMES, *UNITS, *HABITS)}
 OWN = {"ctrl": ("m_shoulder", "m_elbow"), "qpos": ("shoulder", "elbow")}
 MODELS = {"arm": mujoco.MjModel.from_xml_string(ARM), "servo": mujoco.MjModel.from_xml_string(SERVO)}
 
@@ -39,7 +40,7 @@ def true(log: Log, case: Case) -> None:
 
 
 def test_there_are_many_and_each_has_a_name_and_a_source() -> None:
-    every = (*TEXTS, *TIMES, *UNITS)
+    every = (*TEXTS, *TIMES, *UNITS, *HABITS)
     assert len(every) == len(CASES) >= 60
     assert all(":" in case.complaint for case in every)
     assert all(case.words for case in every if case.refused)
