@@ -30,7 +30,7 @@ HEAD = """# Proposed from the names of the columns; look through it, and edit it
 """
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc")
 CONVERTED = {".mcap": "from-mcap", ".bag": "from-rosbag", ".db3": "from-rosbag", ".parquet": "from-lerobot",
-             ".hdf5": "from-hdf5", ".h5": "from-hdf5"}  # fmt: skip
+             ".hdf5": "from-hdf5", ".h5": "from-hdf5", ".pt": "from-pace"}  # fmt: skip
 
 
 @dataclass
@@ -110,7 +110,9 @@ def _proposed(out: Overview, files: Sequence[Path], model: mujoco.MjModel | None
     except UserError as error:
         out.missing.append(str(error))
         return LogMap.read(content)
-    found = Proposal() if first.suffix == ".npz" or native(table.columns) else propose(list(table.columns), model)
+    found = (
+        Proposal() if first.suffix == ".npz" or native(table.columns) else propose(list(table.columns), model, table)
+    )
     plain = found.time == "time" and not (found.ctrl or found.qpos or found.qvel or found.streams)
     content |= {} if plain else found.blocks()
     out.notes += found.questions

@@ -10,9 +10,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from bayessim_mjx.logs import units
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs import units, vendors
 from bayessim_mjx.logs.check import STREAMS
 from bayessim_mjx.logs.log import Channels
+from bayessim_mjx.logs.table import Table
 
 _WORDS = {  # of a column's name, besides that of the joint; the first kind that has one of them wins
     "ctrl": "cmd command commands commanded target goal desired des ctrl control setpoint sp ref reference action u",
@@ -34,6 +36,7 @@ class Proposal:
 
     Attributes:
         time: the entry, or None. ctrl, qpos, qvel, streams: entries by channel, a column's name or keys of a source.
+        metadata: what the columns say of all logs, as the controller in the drives.
         questions: sentences for the user.
     """
 
@@ -42,11 +45,12 @@ class Proposal:
     qpos: dict[str, Any] = field(default_factory=dict)
     qvel: dict[str, Any] = field(default_factory=dict)
     streams: dict[str, Any] = field(default_factory=dict)
+    metadata: dict[str, Any] = field(default_factory=dict)
     questions: list[str] = field(default_factory=list)
 
     def blocks(self) -> dict[str, Any]:
         """The blocks of the map that hold something."""
-        every = {key: getattr(self, key) for key in ("time", "ctrl", "qpos", "qvel", "streams")}
+        every = {key: getattr(self, key) for key in ("time", "ctrl", "qpos", "qvel", "streams", "metadata")}
         return {key: block for key, block in every.items() if block}
 
 
@@ -63,11 +67,12 @@ def native(columns: Iterable[str]) -> bool:
     return any(column.partition(":")[0] in STREAMS and ":" in column for column in columns)
 
 
-def propose(columns: Sequence[str], model: mujoco.MjModel | None) -> Proposal:
-    """The map that the names suggest.
+def propose(columns: Sequence[str], model: mujoco.MjModel | None, table: Table | None = None) -> Proposal:
+    """Suggest a map by the names of columns.
 
     Args:
         columns: of the file. model: names joints and actuators; without it only the time is found.
+        table: the file, whose values say how a vendor's drives were commanded.
     """
     out = Proposal()
     clocks = [c for c in columns if _is_clock(c)]
@@ -77,6 +82,10 @@ def propose(columns: Sequence[str], model: mujoco.MjModel | None) -> Proposal:
         if len(clocks) > 1:
             out.questions.append(f"time may be {' or '.join(clocks)}; the map takes {clocks[0]}")
     if model is None:
+        return out
+    dialect = vendors.dialect_of(columns)
+    if dialect is not None:
+        _of_vendor(out, dialect, columns, model, table)
         return out
     found: dict[tuple[str, str], list[str]] = {}
     for column in columns:
@@ -92,6 +101,54 @@ def propose(columns: Sequence[str], model: mujoco.MjModel | None) -> Proposal:
     if out.qvel and set(out.qvel) != set(Channels.of(model).qvel):
         out.questions.append("qvel names some joints only; `diagnose` allows that, `real.logs` needs all or none")
     return out
+
+
+def _of_vendor(
+    out: Proposal, dialect: vendors.Dialect, columns: Sequence[str], model: mujoco.MjModel, table: Table | None
+) -> None:
+    """Fill the proposal for columns that a vendor's tool numbers."""
+    clock = next((c for c in columns if re.fullmatch(dialect.clock[0], c)), None)
+    if clock is not None and out.time in (None, clock):
+        out.time = clock if dialect.clock[1] == "s" else {"column": clock, "unit": dialect.clock[1]}
+    try:
+        joints = vendors.motors(dialect.vendor, vendors.hinges(model))
+    except UserError as error:
+        out.questions.append(str(error))
+        return
+    by = vendors.numbered(dialect, columns)
+    channels = Channels.of(model)
+    for number, joint in joints.items():
+        drive = _actuator_of(model, channels, joint)
+        for kind, block, name in (("qpos", out.qpos, joint), ("qvel", out.qvel, joint),
+                                  ("effort", out.streams, f"effort:{drive}" if drive else "")):  # fmt: skip
+            if name and number in by[kind]:
+                block[name] = by[kind][number]
+        if drive is not None:
+            _command(out, by, number, drive, vendors.is_servo(model, channels.actuators.index(drive)), table)
+    out.questions += [note for kind, note in dialect.notes.items() if by[kind] and (kind != "torque" or out.ctrl)]
+    out.questions.append(f"numbers of {dialect.vendor} are joints: " + ", ".join(f"{i} {j}" for i, j in joints.items()))
+
+
+def _command(
+    out: Proposal, by: Mapping[str, Mapping[int, str]], number: int, drive: str, servo: bool, table: Table | None
+) -> None:
+    """Propose the column that commands one drive: its target, a torque, or none where several terms are summed."""
+    target, torque = by["target"].get(number), by.get("torque", {}).get(number)
+    if servo or torque is not None:
+        column = target if servo else torque
+        if column is not None:
+            out.ctrl[drive] = column
+        return
+    kind, law = vendors.laws(table, by, number) if table is not None else ("", {})
+    if kind and number in by[kind]:
+        out.ctrl[drive] = by[kind][number]
+        if law:
+            out.metadata.setdefault("controller", {})[drive] = law
+    elif target is not None:
+        text = f"ctrl.{drive}: the model takes a torque, and {target} is a target"
+        out.questions.append(
+            f"{text}; `metadata: {{controller: {{{drive}: {{law: position, kp: ..., kd: ...}}}}}}` declares its law"
+        )
 
 
 def _is_clock(column: str) -> bool:

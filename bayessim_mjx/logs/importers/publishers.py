@@ -8,16 +8,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.importers.messages import FIELDS, Message
+from bayessim_mjx.logs.importers.streams import Stream
 from bayessim_mjx.logs.log import Array
 from bayessim_mjx.logs.signals import quantum
+from bayessim_mjx.quantities import percent
 
 # Rules of thumb, not measured.
 LEAST = 5e-3  # rad or m, apart from which two values are two
 COUNTS = 20.0  # steps of an encoder, within which a value may flicker; rule of thumb
 STEPS = 8.0  # usual steps from sample to sample, beyond which a value is off a smooth motion; rule of thumb
+FAR = 0.25  # of the variance that one order leaves, what another may leave to be far better: half the amplitude
 FEW = 5  # values off the motion from which another publisher is behind them; rule of thumb
 
 
@@ -149,6 +153,54 @@ def _two_tracks(messages: Sequence[Message]) -> str:
     return ""
 
 
+def order_doubt(
+    name: str, topic: str, sent: Mapping[str, Stream], measured: Mapping[str, Mapping[str, Stream]]
+) -> list[str]:
+    """A note where the values of an array fit the motion far better in another order than in the given one.
+
+    Each command is explained by a linear combination of one joint's position, velocity and its sign, and effort; of
+    all orders the one that explains most is compared with the given one (Kuhn 1955, linear assignment).
+    """
+    joints = [j for j in sent if j in measured["position"]]
+    if len(joints) < 2:
+        return []
+    clock = measured["position"][joints[0]].sorted().time
+    if len(clock) < 4 * len(joints):
+        return []
+    left = np.ones((len(joints), len(joints)))
+    for i, command in enumerate(joints):
+        for j, joint in enumerate(joints):
+            left[i, j] = _unexplained(sent[command].on(clock), _features(measured, joint, clock))
+    rows, best = linear_sum_assignment(np.log(np.maximum(left, np.finfo(np.float32).eps)))
+    moved = rows != best
+    if not moved.any() or left[rows, best][moved].mean() > FAR * left[rows, rows][moved].mean():
+        return []
+    order = ",".join(joints[j] for j in best)
+    share, given = (percent(float(1.0 - left[rows, k][moved].mean())) for k in (best, rows))
+    text = f"{name}: {topic}: the motion fits the order {order} far better than {','.join(joints)}"
+    return [
+        f"{text} (explains {share} in place of {given}): --commands {topic}={order}, if that is the controller's order"
+    ]
+
+
+def _features(measured: Mapping[str, Mapping[str, Stream]], joint: str, clock: Array) -> Array:
+    """[T, n] of what one joint shows at the times [T]."""
+    q = measured["position"][joint].on(clock)
+    seen = {k: measured[k][joint].on(clock) for k in ("velocity", "effort") if joint in measured[k]}
+    speed = seen.get("velocity", np.gradient(q, clock))
+    return np.stack([np.ones_like(q), q, speed, np.sign(speed), *[seen[k] for k in ("effort",) if k in seen]], 1)
+
+
+def _unexplained(x: Array, features: Array) -> float:
+    """Share of the variance of x [T] that no combination of the features [T, n] explains."""
+    known = np.isfinite(x) & np.isfinite(features).all(axis=1)
+    x, features = x[known], features[known]
+    if len(x) <= features.shape[1] or np.ptp(x) == 0:
+        return 1.0
+    residual = x - features @ np.linalg.lstsq(features, x, rcond=None)[0]
+    return float(np.var(residual) / np.var(x))
+
+
 def several_senders(name: str, topics: Iterable[str], by_topic: Mapping[str, Sequence[Any]]) -> list[str]:
     """Notes on topics of commands that several nodes sent to: a drive acts on all of them."""
     out = []
@@ -160,4 +212,4 @@ def several_senders(name: str, topics: Iterable[str], by_topic: Mapping[str, Seq
     return out
 
 
-__all__ = ["of_one_publisher", "several_senders"]
+__all__ = ["of_one_publisher", "order_doubt", "several_senders"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -61,7 +61,7 @@ class Recording:
     Attributes:
         name: of the file that is written, without its ending.
         positions, velocities, efforts: by joint. commands: by joint or actuator. others: by column.
-        notes: what the user should know.
+        notes: what the user should know. laws: of the controllers in the drives, by joint (`metadata.controller`).
     """
 
     name: str
@@ -71,6 +71,7 @@ class Recording:
     efforts: Mapping[str, Stream] = field(default_factory=dict)
     others: Mapping[str, Stream] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    laws: Mapping[str, Any] = field(default_factory=dict)
 
     def columns(self) -> tuple[dict[str, Array], int]:
         """All signals on one clock, that of the first joint's positions: ({column: [T]}, rows that were left out).
@@ -104,7 +105,12 @@ class Recording:
 
 
 def recording(
-    name: str, time: Array, arrays: Mapping[str, Array], names: Mapping[str, Sequence[str]], notes: Sequence[str] = ()
+    name: str,
+    time: Array,
+    arrays: Mapping[str, Array],
+    names: Mapping[str, Sequence[str]],
+    notes: Sequence[str] = (),
+    laws: Mapping[str, Any] | None = None,
 ) -> Recording:
     """The recording of arrays `positions`, `commands` [T, n] and, where there are some, `velocities` and `efforts`.
 
@@ -113,7 +119,7 @@ def recording(
         time: [T], s.
         arrays: by what they are.
         names: of the columns of each.
-        notes: what the user should know.
+        notes: what the user should know. laws: of the drives, by joint.
 
     Raises:
         UserError: another number of rows or columns than times or names.
@@ -126,7 +132,7 @@ def recording(
             raise UserError(f"{name}: {what} of shape {np.shape(values)}; {allowed}")
         kind = "held" if what == "commands" else "measured"
         streams[what] = {j: Stream(time, c, kind) for j, c in zip(names[what], table.T, strict=True)}  # type: ignore[arg-type]
-    return Recording(name, **streams, notes=notes)  # type: ignore[arg-type]
+    return Recording(name, **streams, notes=notes, laws=laws or {})  # type: ignore[arg-type]
 
 
 def numbered(given: Sequence[str] | None, count: int) -> list[str]:
