@@ -144,7 +144,7 @@ def _arrays(args: argparse.Namespace) -> Any:
 
 
 def _logs(argv: Sequence[str] | None) -> int:
-    """Recordings of other tools as a folder of logs; exit code 0, or 2 (bad input)."""
+    """Convert recordings of other tools to a folder of logs, or check logs; exit code 0, or 2 (bad input)."""
     args = _parser().parse_args(argv)
     if args.format == "check":
         return _checked(args)

@@ -61,7 +61,7 @@ def check_names(table: Table, columns: Mapping[str, Array], channels: Channels) 
 
 
 def check_finite(table: Table, columns: Mapping[str, Array], channels: Channels) -> None:
-    """What is needed is finite.
+    """Refuse what is needed and not finite.
 
     Raises:
         UserError: NaN, infinity, or a number too large to compute with.
@@ -75,7 +75,7 @@ def check_finite(table: Table, columns: Mapping[str, Array], channels: Channels)
 
 
 def _mend_of(time: Array) -> str:
-    """The key of the map for stamps that stand still or run back."""
+    """Name the key of the map for stamps that stand still or run back."""
     grain = coarseness(time)
     if grain:
         rate = round((len(time) - 1) / max(float(time[-1] - time[0]), 1e-9), 3)

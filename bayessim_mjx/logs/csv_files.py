@@ -117,14 +117,14 @@ def _other_delimiter(path: Path, names: Sequence[str], lines: Sequence[Sequence[
 
 
 def _no_header(path: Path, fields: Sequence[str], names: Sequence[str]) -> None:
-    """A first line of numbers with fractions is no header; whole numbers may be names."""
+    """Refuse a first line of numbers with fractions as a header; whole numbers may be names."""
     if all(map(is_number, names)) and not all(name.lstrip("+-").isdigit() for name in names):
         text = f"{path}: the first line ({', '.join(fields[:4])} ...) holds numbers, not names"
         raise UserError(f"{text}; `header: false` in a map numbers the columns from 0, and keeps that line as a row")
 
 
 def _units_row(path: Path, body: Sequence[Sequence[str]], first: int) -> None:
-    """A line of words above lines of numbers is a line of units."""
+    """Refuse a line of words above lines of numbers: it is a line of units."""
     if len(body) < 3:
         return
     words = [not is_number(f) and bool(f.strip()) for f in body[0]]
@@ -138,7 +138,7 @@ def _units_row(path: Path, body: Sequence[Sequence[str]], first: int) -> None:
 def _why_ragged(
     text: Sequence[str], body: Sequence[Sequence[str]], names: Sequence[str], delimiter: str, ragged: Mapping[int, str]
 ) -> str:
-    """What may be behind rows of other lengths, and the keys that mend it."""
+    """Name the likely cause of rows of other lengths, and the keys that mend it."""
     if delimiter == "," and len(ragged) == len(body) and all(len(fields) == 2 * len(names) for fields in body):
         return (
             "; each row has twice as many: commas separate the fields and are decimal marks too, and the two cannot be "

@@ -134,7 +134,7 @@ def _many_turns(table: Table, name: str, x: Array) -> None:
 
 
 def _by_counting(table: Table, name: str, x: Array, kind: str) -> None:
-    """A joint that moves from whole number to whole number has another unit than rad and m."""
+    """Refuse a joint that moves from whole number to whole number: its unit is neither rad nor m."""
     if not _whole(x) or values_shown(x) < LEVELS:
         return
     own, others = ("rad", (units.COUNTS, "deg")) if kind == "hinge" else ("m", ("mm", units.PERCENT))
@@ -169,7 +169,7 @@ def _fitting(x: Array, kind: str, low: float, high: float) -> list[str]:
 
 
 def _by_target(table: Table, reading: str, target: str, columns: Mapping[str, Array]) -> None:
-    """A joint that follows its target with the amplitude of another unit, of a gear, or mirrored."""
+    """Find a joint that follows its target with the amplitude of another unit, of a gear, or mirrored."""
     q, c = columns[reading], columns[target]
     if not (np.ptp(q) > 0 and np.ptp(c) > 0):
         return

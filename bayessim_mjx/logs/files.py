@@ -30,7 +30,7 @@ Paths = str | Path | Sequence[str | Path]
 
 
 def map_of_folder(paths: Paths) -> Path | None:
-    """The `map.yaml` of the one folder that is given, if it has one."""
+    """Return the `map.yaml` of the one folder that is given, if it has one."""
     given = _listed(paths)
     own = given[0] / "map.yaml" if len(given) == 1 else None
     return own if own is not None and own.is_file() else None
@@ -78,7 +78,7 @@ def distinct(files: Sequence[Path]) -> list[Path]:
 
 
 def side_yaml(path: Path) -> Mapping[str, Any]:
-    """The metadata beside a log: `run1.yaml` of `run1.csv`; a warning for a key that looks misspelt."""
+    """Read the metadata beside a log: `run1.yaml` of `run1.csv`; warn of a key that looks misspelt."""
     side = path.with_suffix(".yaml")
     content = read_yaml(side) if side.is_file() and side.name != "map.yaml" else {}
     for key in content:

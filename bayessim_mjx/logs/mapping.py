@@ -75,7 +75,7 @@ class Source:
         return self.sign * scale, self.offset
 
     def read(self, table: Table, where: str) -> Array:
-        """The channel [T] from the table.
+        """Return the channel [T] from the table.
 
         Raises:
             UserError: no such column, a field that is no number or does not fit the register.
@@ -114,7 +114,7 @@ class Source:
         return np.where(fits, np.where(raw >= half, half - raw, raw), np.nan)
 
     def name(self, table: Table, where: str) -> str:
-        """The column's name in the table.
+        """Return the column's name in the table.
 
         Raises:
             UserError: no such column.
@@ -123,7 +123,7 @@ class Source:
 
 
 def column_of(table: Table, column: str | int | None, where: str) -> str:
-    """The name in the table of a column that is given by its name or its index from 0.
+    """Return the name in the table of a column that is given by its name or its index from 0.
 
     Raises:
         UserError: no such column.
@@ -245,7 +245,7 @@ class LogMap:
         return bool(self.ctrl or self.qpos or self.qvel or self.streams)
 
     def clock(self, table: Table) -> Array:
-        """The times of the rows [T], s.
+        """Return the times of the rows [T], s.
 
         Raises:
             UserError: no such column, a field that is no time.

@@ -100,7 +100,7 @@ def _files(path: Path, log_map: LogMap | None) -> list[Path]:
 
 
 def _proposed(out: Overview, files: Sequence[Path], model: mujoco.MjModel | None) -> LogMap:
-    """The map that the first file suggests; its text goes into the overview."""
+    """Return the map that the first file suggests; its text goes into the overview."""
     first = files[0]
     content: dict[str, Any] = {"files": f"*{first.suffix}"}
     try:
@@ -214,7 +214,7 @@ def _column(
 
 
 def _how(source: Source) -> str:
-    """What the map does to the column."""
+    """Say how the map changes the column."""
     keys = ("scale", "sign", "zero", "offset", "resolution", "range", "torque_constant", "signed", "sign_magnitude",
             "wrap", "rate", "format")  # fmt: skip
     plain = Source()
@@ -240,7 +240,7 @@ def _clock(time: Array | None, log_map: LogMap) -> tuple[str, ...]:
 
 
 def _read(out: Overview, files: Sequence[Path], log_map: LogMap, model: mujoco.MjModel) -> None:
-    """Reads the logs as a diagnosis does; its warnings are notes, its refusal is what is missing."""
+    """Read the logs as a diagnosis does; its warnings are notes, its refusal is what is missing."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:

@@ -49,7 +49,7 @@ class Proposal:
     questions: list[str] = field(default_factory=list)
 
     def blocks(self) -> dict[str, Any]:
-        """The blocks of the map that hold something."""
+        """Return the blocks of the map that hold something."""
         every = {key: getattr(self, key) for key in ("time", "ctrl", "qpos", "qvel", "streams", "metadata")}
         return {key: block for key, block in every.items() if block}
 
@@ -175,7 +175,7 @@ def _channel(column: str, model: mujoco.MjModel) -> tuple[str, str] | None:
 
 
 def _longest(words: Sequence[str], names: Iterable[str]) -> str | None:
-    """The name whose words stand in a row among these; the longest, if it is the only one of its length."""
+    """Return the name whose words stand in a row among these; the longest, if it is the only one of its length."""
     fits: dict[int, list[str]] = {}
     for name in names:
         own = parts(name)
@@ -221,7 +221,7 @@ def _entry(out: Proposal, kind: str, name: str, column: str, model: mujoco.MjMod
 
 
 def hint(columns: Sequence[str], model: mujoco.MjModel) -> str:
-    """The tail of a refusal: the keys of a map that name the columns, and what none of them can be; or ""."""
+    """Return the tail of a refusal: the keys of a map that name the columns, and what none of them can be; or ""."""
     found = propose(columns, model)
     if not (found.qpos or found.qvel or found.ctrl):
         return ""
@@ -232,7 +232,7 @@ def hint(columns: Sequence[str], model: mujoco.MjModel) -> str:
 
 
 def missing_of(found: Proposal, channels: Channels) -> list[str]:
-    """What a diagnosis needs and the proposal lacks."""
+    """List the channels that a diagnosis needs and the proposal lacks."""
     lost = [f"ctrl:{name}" for name in channels.actuators if name not in found.ctrl]
     commands = [f"commands ({', '.join(lost)})"] if lost else []
     return ([] if found.time is not None else ["time (or `rate`, rows per second)"]) + commands

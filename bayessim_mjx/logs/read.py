@@ -110,7 +110,7 @@ def _read_one(
 
 
 def table_of(path: Path, log_map: LogMap) -> Table:
-    """The columns of a file as the map says it is written.
+    """Return the columns of a file as the map says it is written.
 
     Raises:
         UserError: a file that cannot be read so.
@@ -139,7 +139,7 @@ def _check_map(log_map: LogMap, channels: Channels) -> None:
 
 
 def _columns(table: Table, channels: Channels, log_map: LogMap) -> tuple[dict[str, Array], dict[str, str]]:
-    """The file's own columns as channels, and {channel: column} of what is needed.
+    """Return the file's own columns as channels, and {channel: column} of what is needed.
 
     Text columns that nobody asked for are left out with a warning.
     """

@@ -21,7 +21,7 @@ def is_even(log: Log, dt: float) -> bool:
 
 
 def resample(log: Log, dt: float, kind: Literal["cubic", "linear"] = "cubic") -> Log:
-    """The log on the grid time[0] + k dt. Command k is held over [t_k, t_k + dt).
+    """Return the log on the grid time[0] + k dt. Command k is held over [t_k, t_k + dt).
 
     Positions and velocities are interpolated. A logged command is held until the next row; the command of a step is
     the *mean* of that held signal over the step (its impulse is kept, no sample is skipped and no delay added).
@@ -71,7 +71,7 @@ def _mean(time: Array, x: Array, grid: Array, dt: float, linear: bool = False) -
 
 
 def _held(even: Log, dt: float) -> Log:
-    """An even log with the means of its commands in their place, where these are linear or late."""
+    """Put the means of the commands of an even log in their place, where these are linear or late."""
     if not even.linear and not even.late:
         return even
     ctrl = _mean(even.time + even.late, even.ctrl, even.time, dt, even.linear)
@@ -102,7 +102,7 @@ def _normalised(log: Log, qpos: Array) -> Array:
 
 
 def around(log: Log, start: int, rows: int) -> NDArray[np.int64]:
-    """Indices of the log's rows `start - rows .. start + rows`; beyond its ends the end is held."""
+    """Return indices of the log's rows `start - rows .. start + rows`; beyond its ends the end is held."""
     return np.clip(np.arange(start - rows, start + rows + 1), 0, len(log) - 1)
 
 
@@ -218,7 +218,7 @@ def _steps(time: Array, x: Array, edges: Array, before: float, after: float) -> 
 
 
 def _ramps(time: Array, x: Array, edges: Array, before: float) -> Array:
-    """The same of the trapezoids between rows: within a row the integral is a parabola."""
+    """Integrate the trapezoids between rows: within a row the integral is a parabola."""
     times, values = np.append(before, time), np.concatenate([x[:1], x])
     steps = np.diff(times)
     area = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(0.5 * (values[1:] + values[:-1]) * steps[:, None], 0)])

@@ -104,7 +104,7 @@ def _doubt(table: Table, column: str, unit: str) -> str:
 
 
 def _named(raw: Array, step: float, table: Table, column: str, unit: str) -> Array:
-    """The column's name bears a unit other than the second."""
+    """Convert stamps of a column whose name bears a unit other than the second."""
     scale = units.TIMES[unit]
     if _period(step * scale) and not _period(step):
         _say(table, column, f"{unit}, as its name says", unit)
@@ -113,7 +113,7 @@ def _named(raw: Array, step: float, table: Table, column: str, unit: str) -> Arr
 
 
 def even(raw: Array, rate: float, table: Table, column: str) -> Array:
-    """Times [T] of rows that follow each other at `rate` [1/s], from stamps that are too coarse or come too late.
+    """Return times [T] of rows that go on at `rate` [1/s], from stamps that are too coarse or come too late.
 
     Raises:
         UserError: stamps with another rate, or with a gap.

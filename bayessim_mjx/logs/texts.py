@@ -24,7 +24,7 @@ _NAMED = re.compile(r'"?sep=(.)"?\s*')
 
 
 def lines_of(path: Path, encoding: str | None, allowed: str) -> list[str]:
-    """The lines of a text file.
+    """Return the lines of a text file.
 
     UTF-8, and UTF-16 and UTF-32 with a byte order mark, need no key. A file whose only other bytes are the signs of
     units (the degree sign) is read as Latin-1.
@@ -71,7 +71,7 @@ def _sixteen(raw: bytes) -> str:
 
 
 def _doubt(raw: bytes, error: UnicodeDecodeError) -> str:
-    """The first line that is not UTF-8, as several encodings read it."""
+    """Return the first line that is not UTF-8, as several encodings read it."""
     start = raw.rfind(b"\n", 0, error.start) + 1
     line = raw[start : error.start + 12].split(b"\n")[0]
     readings: dict[str, str] = {}
@@ -87,7 +87,7 @@ def _doubt(raw: bytes, error: UnicodeDecodeError) -> str:
 
 
 def named_delimiter(line: str) -> str | None:
-    """The delimiter that a spreadsheet's first line `sep=;` names, or None."""
+    """Return the delimiter that a spreadsheet's first line `sep=;` names, or None."""
     match = _NAMED.fullmatch(line.lower())
     return match[1] if match else None
 
@@ -133,7 +133,7 @@ class Marks:
         return self.decimal == "." and self.thousands is None
 
     def number(self, text: str) -> float:
-        """The number that a field holds.
+        """Return the number that a field holds.
 
         Raises:
             ValueError: none, or one that can be read in two ways.

@@ -50,7 +50,7 @@ _END = re.compile(r"(?:[\[(<{]\s*([^\])>}]+?)\s*[\])>}]|(?:^|[_\s.:-])([A-Za-zµ
 
 
 def of_name(column: str) -> str | None:
-    """The unit at the end of a column's name (`angle [deg]`, `t_ms`), or None where it bears none that is known."""
+    """Return the known unit at the end of a column's name (`angle [deg]`, `t_ms`), or None."""
     match = _END.search(column.strip())
     if match is None:
         return None
@@ -61,14 +61,14 @@ def of_name(column: str) -> str | None:
 
 
 def foreign(column: str) -> str | None:
-    """What stands in brackets at the end of a name and is no unit that is known and no index, or None."""
+    """Return text in brackets at the end of a name that is neither a known unit nor an index, or None."""
     match = _END.search(column.strip())
     known = match is None or match[1] is None or of_name(column) is not None
     return None if known or match is None or re.fullmatch(r"[\d\s:,]+", match[1]) else match[0].strip()
 
 
 def scale_of(unit: str, resolution: float | None, torque_constant: float | None) -> float:
-    """The model's unit per unit of the file.
+    """Return the model's unit per unit of the file.
 
     Args:
         unit: other than percent.

@@ -97,14 +97,14 @@ DIALECTS = (
 
 
 def words(name: str) -> str:
-    """A joint's name without marks, prefixes of arms and the word joint."""
+    """Strip a joint's name of marks, prefixes of arms and the word joint."""
     plain = re.sub(r"[^a-z0-9]", "", name.lower().replace("joint", ""))
     plain = re.sub(r"^(?:panda|fr3|ur\d+e?)", "", plain)
     return {"waistyaw": "torso"}.get(plain, plain)
 
 
 def motors(vendor: str, joints: Sequence[str]) -> dict[int, str]:
-    """{number from 0: joint} of one robot of the vendor, where the names of the joints say which.
+    """Return {number from 0: joint} of one robot of the vendor, where the names of the joints say which.
 
     Raises:
         UserError: no robot, or several that number them in different ways.
@@ -127,7 +127,7 @@ def motors(vendor: str, joints: Sequence[str]) -> dict[int, str]:
 
 
 def dialect_of(columns: Sequence[str]) -> Dialect | None:
-    """The dialect that has positions of joints among the columns, or None."""
+    """Return the dialect that has positions of joints among the columns, or None."""
     for dialect in DIALECTS:
         if any(re.fullmatch(dialect.columns["qpos"], column) for column in columns):
             return dialect
@@ -154,20 +154,23 @@ def is_servo(model: mujoco.MjModel, actuator: int) -> bool:
 def law_of(values: Mapping[str, np.ndarray]) -> tuple[str, dict[str, Any]]:
     """(which column alone is the command, its law) of a drive that sums kp (q - target), kd (dq - speed) and a torque.
 
-    It is the target where the gains are constant and the two other terms 0, the torque `ahead` where the gains are 0,
-    and "", a column of its own, elsewhere.
+    It is the `target` where the gains are constant and the two other terms 0; `shifted` where they are not 0, a target
+    moved by (kd speed + ahead) / kp under the same law; the torque `ahead` where the gains are 0; and "" elsewhere.
 
     Args:
         values: columns [T] of kp, kd, speed and ahead, as far as there are some.
     """
     gains = {k: values[k] for k in ("kp", "kd") if k in values}
     rest = [values[k] for k in ("speed", "ahead") if k in values]
-    plain = all(np.ptp(x) == 0 for x in gains.values()) and not any(x.any() for x in rest)
+    constant = all(np.ptp(x) == 0 for x in gains.values())
     if len(gains) == 2 and not any(x.any() for x in gains.values()):
         return "ahead", {}
-    if not plain or "kp" not in gains or not gains["kp"][0] > 0:
+    if not constant or "kp" not in gains or not gains["kp"][0] > 0:
         return "", {}
-    return "target", {"law": "position", **{k: float(x[0]) for k, x in gains.items()}}
+    return "shifted" if any(x.any() for x in rest) else "target", {
+        "law": "position",
+        **{k: float(x[0]) for k, x in gains.items()},
+    }
 
 
 def laws(table: Table, columns: Mapping[str, Mapping[int, str]], number: int) -> tuple[str, dict[str, Any]]:

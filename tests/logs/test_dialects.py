@@ -24,7 +24,7 @@ MODELS = {"arm": mujoco.MjModel.from_xml_string(ARM), "servo": mujoco.MjModel.fr
 
 
 def read(path: Path, case: Case, log_map: Mapping[str, Any] | None) -> tuple[Log, str]:
-    """The one log of a case, and all that was said."""
+    """Return the one log of a case, and all that was said."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         (log,) = read_logs(path, MODELS[case.model], log_map)

@@ -44,7 +44,7 @@ def events() -> Iterator[tuple[str, int, Any]]:
 
 
 def as_sent(log: Log, dt: float = 0.005, rows: int = 80) -> None:
-    """The log of `events`: positions at their own times, commands held for two rows, the IMU interpolated."""
+    """Return the log of `events`: positions at their own times, commands held for two rows, the IMU interpolated."""
     t = dt * np.arange(rows)
     np.testing.assert_allclose(log.time, t, atol=1e-9)
     np.testing.assert_allclose(log.qpos, np.stack([angle(j, t) for j in JOINTS], 1), atol=1e-9)
@@ -91,7 +91,7 @@ def write_mcap(path: Path) -> None:
 
 
 def write_rosbag(path: Path) -> None:
-    """A bag of ROS 2 (a folder), or of ROS 1 (a file)."""
+    """Write a bag of ROS 2 (a folder), or of ROS 1 (a file)."""
     pytest.importorskip("rosbags", reason="the extra [logs] is not installed")
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2

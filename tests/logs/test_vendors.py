@@ -90,10 +90,13 @@ def test_unitrees_motors_are_joints_by_their_names_and_a_law_that_stays_is_decla
 def test_unitrees_torques_are_the_commands_or_the_sum_of_the_law_is() -> None:
     found = recording("run", bag(kp=0.0, kd=0.0, tau=1.5), Choice(hinges=LEG))
     assert set(found.commands[LEG[0]].values) == {1.5} and not found.laws
-    found = recording("run", bag(tau=1.5), Choice(hinges=LEG))
-    np.testing.assert_allclose(
-        found.commands[LEG[1]].values, (20 * (TARGETS - ANGLES) - 0.5 * SPEEDS)[:, 1] + 1.5, atol=1e-9
-    )
+    found = recording("run", bag(tau=1.5, dq=0.2), Choice(hinges=LEG))
+    np.testing.assert_allclose(found.commands[LEG[1]].values, TARGETS[:, 1] + (1.5 + 0.5 * 0.2) / 20, atol=1e-9)
+    assert found.laws[LEG[1]]["kp"] == 20.0
+    varied = [m for i, m in enumerate(bag(tau=1.5)) if i > 1] + bag(tau=1.5, kp=10.0)[:2]
+    found = recording("run", varied, Choice(hinges=LEG))
+    law = 20 * (TARGETS - ANGLES) - 0.5 * SPEEDS
+    np.testing.assert_allclose(found.commands[LEG[1]].sorted().values[1:], law[1:, 1] + 1.5, atol=1e-9)
     assert not found.laws and any("is summed of" in note for note in found.notes)
     found = recording("run", bag(tau=1.5), Choice(hinges=LEG, targets=True))
     np.testing.assert_allclose(found.commands[LEG[1]].values, TARGETS[:, 1])
@@ -232,7 +235,7 @@ def test_an_order_that_fits_far_better_is_reported(torque: bool) -> None:
 
 
 def torch_file(path: Path, content: Mapping[str, Any]) -> Path:
-    """A file as `torch.save` writes it, of arrays of float64."""
+    """Write a file as `torch.save` does, of arrays of float64."""
     utils, torch = ModuleType("torch._utils"), ModuleType("torch")
     exec("def _rebuild_tensor_v2(): ...\n", utils.__dict__)  # its name is what is pickled
     exec("class DoubleStorage: ...\n", torch.__dict__)
@@ -270,7 +273,8 @@ def torch_file(path: Path, content: Mapping[str, Any]) -> Path:
     return path
 
 
-CHIRP = {"time": T, "dof_pos": ANGLES, "des_dof_pos": TARGETS, "kp": np.full(3, 20.0), "kd": np.full(3, 0.5)}
+CHIRP = {"time": T, "dof_pos": ANGLES, "des_dof_pos": TARGETS, "des_dof_vel": np.full((100, 3), 2.0),
+         "kp": np.full(3, 20.0), "kd": np.full(3, 0.5)}  # fmt: skip
 
 
 def test_paces_chirps_are_logs_with_their_law(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -280,7 +284,9 @@ def test_paces_chirps_are_logs_with_their_law(tmp_path: Path, capsys: pytest.Cap
     out = call(capsys, *start, tmp_path / "logs", "--joints", *LEG)
     assert "chirp.yaml declares the position law" in out
     (log,) = logs(tmp_path / "logs", xml)
-    np.testing.assert_allclose(np.c_[log.time, log.qpos, log.ctrl], np.c_[T, ANGLES, TARGETS], atol=1e-9)
+    np.testing.assert_allclose(
+        np.c_[log.time, log.qpos, log.ctrl], np.c_[T, ANGLES, TARGETS + 2.0 * 0.5 / 20], atol=1e-9
+    )
     assert log.metadata["controller"]["FL_hip"] == {"law": "position", "kp": 20.0, "kd": 0.5}
     call(capsys, "from-pace", path, "--model", model(tmp_path, servo=True), "--out", tmp_path / "b", "--joints", *LEG)
     assert not (tmp_path / "b" / "chirp.yaml").exists()  # the model's own servo is the law

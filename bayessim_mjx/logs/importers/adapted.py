@@ -66,7 +66,7 @@ def low_state(message: Message, motors: Mapping[int, str]) -> Message:
 
 
 def motors_of(name: str, messages: Sequence[Message], choice: Choice) -> dict[int, str]:
-    """{number: joint} of the motors that a message numbers.
+    """Return {number: joint} of the motors that a message numbers.
 
     Raises:
         UserError: nobody says which is which.
@@ -91,8 +91,8 @@ def low_commands(
 ) -> tuple[dict[str, Stream], dict[str, Any], list[str]]:  # fmt: skip
     """(commands, laws of the drives, notes) of Unitree's `LowCmd`: u = kp (q* - q) + kd (dq* - dq) + tau.
 
-    Targets are the commands of position servos, and of motors under a law that stays; else the sum is made here, of
-    positions and velocities as they were measured.
+    Targets are the commands of position servos. Of motors under a law that stays they are too, moved by
+    (kd dq* + tau) / kp; else the sum is made here, of positions and velocities as they were measured.
     """
     time = np.array([clock(m) for m in messages])
     sent: dict[str, Stream] = {}
@@ -105,9 +105,12 @@ def low_commands(
         kind, law = vendors.law_of(
             {"kp": column["kp"], "kd": column["kd"], "speed": column["dq"], "ahead": column["tau"]}
         )
-        if choice.targets or kind == "target":
+        if choice.targets:
             sent[joint] = Stream(time[held], column["q"][held], "held")
-            laws |= {} if choice.targets else {joint: law}
+        elif law:
+            shift = (column["kd"] * column["dq"] + column["tau"]) / column["kp"]
+            sent[joint] = Stream(time[held], (column["q"] + shift)[held], "held")
+            laws[joint] = law
         elif kind == "ahead":
             sent[joint] = Stream(time, column["tau"], "held")
         else:

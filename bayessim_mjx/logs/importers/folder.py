@@ -109,12 +109,12 @@ class Target:
         return self.rename.get(name, name)
 
     def _joint(self, column: str) -> str:
-        """The joint's name in the model, "" if it has none."""
+        """Return the joint's name in the model, "" if it has none."""
         name = self._name(column)
         return name if self.model is None or name in Channels.of(self.model).qpos else ""
 
     def _actuator(self, column: str) -> str:
-        """The actuator of this name, or the only one on the joint of this name; "" if there is none."""
+        """Return the actuator of this name, or the only one on the joint of this name; "" if there is none."""
         name = self._name(column)
         if self.model is None:
             return name

@@ -40,7 +40,7 @@ class Paths:
 
 
 def recordings(path: Path, paths: Paths) -> Iterator[Recording]:
-    """The recordings of one file.
+    """Return the recordings of one file.
 
     Raises:
         UserError: no HDF5 file, no array at a path, neither times nor a rate.
@@ -60,7 +60,7 @@ def recordings(path: Path, paths: Paths) -> Iterator[Recording]:
 
 
 def _runs(path: Path, every: Sequence[str], pattern: str) -> list[str]:
-    """What stands for the `*` of the pattern, by its numbers; "" where it has none."""
+    """List the groups that the `*` of the pattern stands for, by their numbers; "" where it has none."""
     pattern = pattern.strip("/")
     if "*" not in pattern:
         return [""]

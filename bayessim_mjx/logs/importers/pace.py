@@ -59,14 +59,14 @@ def _scalar() -> Callable[..., Any]:
 
 
 def _encoded(text: str, encoding: str) -> bytes:
-    """The bytes of an array, which older pickles hold as text."""
+    """Return the bytes of an array, which older pickles hold as text."""
     if encoding != "latin1":
         raise pickle.UnpicklingError(f"bytes as {encoding}")
     return text.encode(encoding)
 
 
 def _tensor(data: Array, start: int, shape: Sequence[int], strides: Sequence[int], *rest: Any) -> Array:
-    """A copy of a tensor's values; a shape that reaches beyond its storage is refused."""
+    """Copy a tensor's values; a shape that reaches beyond its storage is refused."""
     end = start + sum((n - 1) * s for n, s in zip(shape, strides, strict=True))
     if min([start, *shape, *strides]) < 0 or (0 not in shape and end >= len(data)):
         raise pickle.UnpicklingError("a tensor that reaches beyond its storage")
@@ -77,7 +77,7 @@ def _tensor(data: Array, start: int, shape: Sequence[int], strides: Sequence[int
 
 
 def arrays(path: Path) -> dict[str, Array]:
-    """The arrays of a `.pt` file, by name.
+    """Return the arrays of a `.pt` file, by name.
 
     Raises:
         UserError: no such file, something in it that is no array.
@@ -94,7 +94,7 @@ def arrays(path: Path) -> dict[str, Array]:
 
 
 def of_file(path: Path, joints: Sequence[str]) -> Recording:
-    """The recording of one file: `time` [T], `dof_pos`, `des_dof_pos` [T, n], where there are some `dof_vel`, kp, kd.
+    """Read a file of `time` [T], `dof_pos`, `des_dof_pos` [T, n] and, where there are some, `dof_vel`, kp and kd.
 
     Args:
         path: of the file.
@@ -113,8 +113,10 @@ def of_file(path: Path, joints: Sequence[str]) -> Recording:
         raise UserError(
             f"{path}: {count} columns of joints, {given}; allowed: --joints with {count} names in their order"
         )
-    values = {what: found[key] for what, key in WHAT.items() if key in found}
+    values = {what: found[key].astype(float) for what, key in WHAT.items() if key in found}
     gains = {k: np.broadcast_to(np.ravel(found[k]), count) for k in ("kp", "kd") if k in found}
+    if {"kp", "kd"} <= set(gains) and "des_dof_vel" in found:
+        values["commands"] += found["des_dof_vel"] * gains["kd"] / gains["kp"]  # kd dq* as a part of kp q*
     laws = {
         joint: {"law": "position", **{k: float(g[i]) for k, g in gains.items()}} for i, joint in enumerate(joints)
     } if "kp" in gains else {}  # fmt: skip

@@ -50,7 +50,7 @@ class _Form:
 def of_one_publisher(
     name: str, topic: str, messages: Sequence[Message], chosen: int | None, received: bool = False
 ) -> list[Message]:
-    """The messages of joint states of one publisher, or of several that agree or have no joint in common.
+    """Return the messages of joint states of one publisher, or of several that agree or have no joint in common.
 
     Args:
         name: of the recording; topic: of the messages.
@@ -106,7 +106,7 @@ def _track(messages: Iterable[Message], joint: str) -> tuple[Array, Array]:
 
 
 def _apart(ranked: Sequence[tuple[_Form, Sequence[Message]]]) -> str:
-    """Publishers of other forms whose positions lie off those of the first, interleaved with it."""
+    """Find publishers of other forms whose positions lie off those of the first, interleaved with it."""
     for i, (first, many) in enumerate(ranked):
         for second, few in ranked[i + 1 :]:
             for joint in sorted(set(first.names) & set(second.names)):
@@ -156,7 +156,7 @@ def _two_tracks(messages: Sequence[Message]) -> str:
 def order_doubt(
     name: str, topic: str, sent: Mapping[str, Stream], measured: Mapping[str, Mapping[str, Stream]]
 ) -> list[str]:
-    """A note where the values of an array fit the motion far better in another order than in the given one.
+    """Note where the values of an array fit the motion far better in another order than in the given one.
 
     Each command is explained by a linear combination of one joint's position, velocity and its sign, and effort; of
     all orders the one that explains most is compared with the given one (Kuhn 1955, linear assignment).
@@ -202,7 +202,7 @@ def _unexplained(x: Array, features: Array) -> float:
 
 
 def several_senders(name: str, topics: Iterable[str], by_topic: Mapping[str, Sequence[Any]]) -> list[str]:
-    """Notes on topics of commands that several nodes sent to: a drive acts on all of them."""
+    """Note topics of commands that several nodes sent to: a drive acts on all of them."""
     out = []
     for topic in topics:
         senders = sorted({m.publisher for m in by_topic[topic]})

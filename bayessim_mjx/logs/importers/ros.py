@@ -35,7 +35,7 @@ from bayessim_mjx.logs.importers.streams import Recording, Stream
 
 
 def recording(name: str, messages: Iterable[Message], choice: Choice) -> Recording:
-    """The recording of one bag.
+    """Return the recording of one bag.
 
     Raises:
         UserError: topics that are missing or that cannot be told apart, arrays whose order is not known.
@@ -72,7 +72,7 @@ def recording(name: str, messages: Iterable[Message], choice: Choice) -> Recordi
 
 
 def _states(name: str, messages: Sequence[Message], choice: Choice) -> list[Message]:
-    """The messages as ones of `JointState`."""
+    """Return the messages as ones of `JointState`."""
     kind = messages[0].kind
     if kind == LOW_STATE:
         motors = adapted.motors_of(name, messages, choice)
@@ -213,7 +213,7 @@ def _order(name: str, topic: str, message: Message, count: int, joints: Sequence
 
 
 def _field(name: str, topic: str, bodies: Sequence[Any], fields: Sequence[str], choice: Choice) -> str:
-    """The field that holds the commands."""
+    """Return the field that holds the commands."""
     filled = [f for f in fields if any(len(getattr(b, f)) for b in bodies)]
     wanted = [f for f in filled if choice.field is not None and f.startswith(choice.field)]
     if len(wanted or filled) != 1 or (choice.field is not None and not wanted):

@@ -112,7 +112,7 @@ def recording(
     notes: Sequence[str] = (),
     laws: Mapping[str, Any] | None = None,
 ) -> Recording:
-    """The recording of arrays `positions`, `commands` [T, n] and, where there are some, `velocities` and `efforts`.
+    """Join arrays `positions`, `commands` [T, n] and, where there are some, `velocities` and `efforts`.
 
     Args:
         name: of the run.
