@@ -17,10 +17,12 @@ from bayessim_mjx.logs.log import Channels
 from bayessim_mjx.logs.table import Table
 
 _WORDS = {  # of a column's name, besides that of the joint; the first kind that has one of them wins
-    "ctrl": "cmd command commands commanded target goal desired des ctrl control setpoint sp ref reference action u",
+    "ctrl": "cmd command commands commanded target goal desired des ctrl control setpoint sp ref reference action u "
+    "soll sollwert consigne",
     "effort": "effort torque tau current load force iq moment",
     "qvel": "vel velocity velocities speed qd dq qvel omega rate",
-    "qpos": "pos position positions q angle qpos actual measured meas present state ist winkel joint encoder enc",
+    "qpos": "pos position positions q angle qpos actual measured meas present state joint encoder enc ist istwert "
+    "winkel",
 }
 KINDS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
 _CLOCK = frozenset(
@@ -76,7 +78,11 @@ def propose(columns: Sequence[str], model: mujoco.MjModel | None, table: Table |
     """
     out = Proposal()
     clocks = [c for c in columns if _is_clock(c)]
-    if clocks:
+    halves = _halves(columns)
+    if halves:
+        clocks = list(halves)
+        out.time = {"column": halves[0], "nanoseconds": halves[1]}
+    elif clocks:
         unit = units.of_name(clocks[0])
         out.time = {"column": clocks[0], "unit": unit} if unit in units.TIMES and unit != "s" else clocks[0]
         if len(clocks) > 1:
@@ -88,8 +94,9 @@ def propose(columns: Sequence[str], model: mujoco.MjModel | None, table: Table |
         _of_vendor(out, dialect, columns, model, table)
         return out
     found: dict[tuple[str, str], list[str]] = {}
+    named = _named(columns, table)
     for column in columns:
-        channel = None if column in clocks else _channel(column, model)
+        channel = None if column in clocks else _channel(named.get(column, column), model)
         if channel is not None:
             found.setdefault(channel, []).append(column)
     for (kind, name), own in found.items():
@@ -149,6 +156,30 @@ def _command(
         out.questions.append(
             f"{text}; `metadata: {{controller: {{{drive}: {{law: position, kp: ..., kd: ...}}}}}}` declares its law"
         )
+
+
+def _halves(columns: Sequence[str]) -> tuple[str, str] | None:
+    """Return the columns of whole seconds and of nanoseconds, as ROS writes a stamp."""
+    pairs = [(c, re.fullmatch(r"(.*?)(n?)(?:ano)?(secs?|seconds)", c.lower())) for c in columns]
+    whole = {m[1]: c for c, m in pairs if m and not m[2]}
+    rest = {m[1]: c for c, m in pairs if m and m[2]}
+    both = [start for start in whole if start in rest]
+    return (whole[both[0]], rest[both[0]]) if both else None
+
+
+def _named(columns: Sequence[str], table: Table | None) -> dict[str, str]:
+    """Return {column: name with its joint} of `field.position0` beside `field.name0` (`rostopic echo -p`).
+
+    A column of names that changes from row to row names nothing.
+    """
+    out: dict[str, str] = {}
+    for column in columns if table is not None else ():
+        match = re.fullmatch(r"(.*\.)name(\d+)", column)
+        values = {str(v).strip() for v in table.columns[column]} if match and table is not None else set()
+        if match and len(values) == 1:
+            kinds = ("position", "velocity", "effort")
+            out |= {f"{match[1]}{kind}{match[2]}": f"{next(iter(values))}.{kind}" for kind in kinds}
+    return out
 
 
 def _is_clock(column: str) -> bool:

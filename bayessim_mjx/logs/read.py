@@ -119,7 +119,7 @@ def table_of(path: Path, log_map: LogMap) -> Table:
     if path.suffix == ".npz":
         return replace(read_npz(path), lenient=form.lenient)
     if path.suffix == ".jsonl":
-        return read_jsonl(path, form.skip_rows, form.lenient, form.encoding)
+        return read_jsonl(path, form.skip_rows, form.lenient, form.encoding, form.decimal)
     return read_csv(path, form)
 
 

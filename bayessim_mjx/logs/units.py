@@ -44,7 +44,7 @@ _IN_BRACKETS = {
     "a": "A", "amp": "A", "amps": "A", "n": "N", "v": "V", "volt": "V", "volts": "V", "m": "m", "nm": "N m",
     "n.m": "N m",
     "radian": "rad", "radians": "rad", "m/s": "m/s", "min": "min", "rev": "rev", "turn": "rev", "count": COUNTS,
-    "1": PLAIN, "-": PLAIN, "": PLAIN, "v/v": PLAIN,
+    "-": PLAIN,
 }  # fmt: skip
 _END = re.compile(r"(?:[\[(<{]\s*([^\])>}]+?)\s*[\])>}]|(?:^|[_\s.:-])([A-Za-zµμ°%]+(?:/s)?))\s*$")
 
