@@ -18,12 +18,15 @@ from bayessim_mjx.logs import units
 from bayessim_mjx.logs.check import needed_columns
 from bayessim_mjx.logs.csv_files import form_of
 from bayessim_mjx.logs.files import SUFFIXES, map_of_folder
-from bayessim_mjx.logs.log import Array, Channels
+from bayessim_mjx.logs.importers.publishers import better_order
+from bayessim_mjx.logs.importers.streams import Stream
+from bayessim_mjx.logs.log import Array, Channels, Log
 from bayessim_mjx.logs.mapping import LogMap, Source
 from bayessim_mjx.logs.pieces import MAX_GAP, SHORT_GAP
-from bayessim_mjx.logs.proposal import Proposal, native, propose
+from bayessim_mjx.logs.proposal import Proposal, drives, native, propose
 from bayessim_mjx.logs.read import read_logs, table_of
 from bayessim_mjx.logs.table import Table
+from bayessim_mjx.logs.vendors import hinges
 
 HEAD = """# Proposed from the names of the columns; look through it, and edit it (docs/logs.md).
 # A channel is `name: column`, or `name: {column: ..., unit: deg, sign: -1, offset: 0.1}`.
@@ -244,10 +247,28 @@ def _read(out: Overview, files: Sequence[Path], log_map: LogMap, model: mujoco.M
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            read_logs(files, model, log_map, partial=True)
+            logs = read_logs(files, model, log_map, partial=True)
+            out.notes += list(dict.fromkeys(text for log in logs if (text := _order(log, model))))
         except UserError:
             out.missing += [text for text in (_refusal(file, log_map, model) for file in files) if text]
     out.notes += list(dict.fromkeys(str(w.message) for w in said))
+
+
+def _order(log: Log, model: mujoco.MjModel) -> str:
+    """Say which other order of the commands fits the motion far better, if one does."""
+    drive_of = {j: own[0] for j in hinges(model) if len(own := drives(model, log.joints.index(j))) == 1}
+    kinds = {"position": (log.qpos, log.channels.qpos, "qpos"), "velocity": (log.qvel, log.channels.qvel, "qvel")}
+    measured = {
+        kind: {j: Stream(log.time, x[:, names.index(j)]) for j in drive_of if f"{stream}:{j}" not in log.absent}
+        for kind, (x, names, stream) in kinds.items()
+    }
+    sent = {j: Stream(log.time, log.ctrl[:, i], "held") for j, i in drive_of.items()}
+    found = better_order(sent, {**measured, "effort": {}})
+    if found is None:
+        return ""
+    given, better = ([log.actuators[drive_of[j]] for j in order] for order in found[:2])
+    text = f"the commands {', '.join(given)} fit the motion far better as those of {', '.join(better)} ({found[2]})"
+    return f"{text}; `ctrl` in the map says which column is whose"
 
 
 def _refusal(file: Path, log_map: LogMap, model: mujoco.MjModel) -> str:

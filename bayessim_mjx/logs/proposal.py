@@ -216,19 +216,20 @@ def _longest(words: Sequence[str], names: Iterable[str]) -> str | None:
     return best[0] if len(best) == 1 else None
 
 
-def _drives(model: mujoco.MjModel, joint: int) -> list[int]:
+def drives(model: mujoco.MjModel, joint: int) -> list[int]:
+    """Return the numbers of the actuators on a joint."""
     types = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     on_joint = np.isin(model.actuator_trntype, types)
     return [int(i) for i in np.flatnonzero(on_joint & (model.actuator_trnid[:, 0] == joint))]
 
 
 def _actuator_of(model: mujoco.MjModel, channels: Channels, joint: str) -> str | None:
-    own = _drives(model, channels.joints.index(joint))
+    own = drives(model, channels.joints.index(joint))
     return channels.actuators[own[0]] if len(own) == 1 else None
 
 
 def _joint_of(model: mujoco.MjModel, channels: Channels, actuator: str) -> str | None:
-    own = [j for j in range(model.njnt) if channels.actuators.index(actuator) in _drives(model, j)]
+    own = [j for j in range(model.njnt) if channels.actuators.index(actuator) in drives(model, j)]
     return channels.joints[own[0]] if len(own) == 1 else None
 
 
@@ -275,4 +276,4 @@ def _short(block: Any) -> str:
     return str(block)
 
 
-__all__ = ["Proposal", "hint", "missing_of", "native", "parts", "propose"]
+__all__ = ["Proposal", "drives", "hint", "missing_of", "native", "parts", "propose"]

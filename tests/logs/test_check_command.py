@@ -149,3 +149,13 @@ def test_stamps_in_two_columns_and_names_in_columns_of_their_own_are_understood(
     (folder / "run.csv").write_text("\n".join([head, *lines]))
     code, out = check(capsys, folder, "--model", model_of(tmp_path))
     assert code == 2 and "positions: qpos:shoulder, qpos:elbow" in out
+
+
+def test_commands_that_fit_the_other_joint_are_noted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    t = 0.01 * np.arange(200)
+    q = np.stack([0.5 * np.sin(3 * t), 0.3 * np.sin(5 * t + 1)], 1)
+    table = np.c_[t, q[:, ::-1], q]
+    _, out = check(capsys, logs_of(tmp_path, table, HEADER), "--model", model_of(tmp_path))
+    assert "the commands m_shoulder, m_elbow fit the motion far better as those of m_elbow, m_shoulder" in out, out
+    _, out = check(capsys, logs_of(tmp_path, np.c_[t, q, q], HEADER), "--model", model_of(tmp_path))
+    assert "far better" not in out

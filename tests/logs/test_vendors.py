@@ -170,56 +170,16 @@ def test_urs_csv_has_targets_for_servos_and_no_torque(tmp_path: Path, capsys: py
     assert code == 2 and "target_q_0 is a target" in out and "law: position" in out, out
 
 
-def header(k: int) -> Any:
-    return stamp(START + STEP * k)
-
-
-def test_dynamic_joint_states_are_states_with_further_interfaces() -> None:
-    def state(k: int) -> Message:
-        values = [named(interface_names=["position", "current"], values=[0.01 * k, 2.0]),
-                  named(interface_names=["effort"], values=[1.0])]  # fmt: skip
-        body = named(header=header(k), joint_names=["elbow", "gripper"], interface_values=values)
-        return Message("/dynamic_joint_states", "DynamicJointState", START + STEP * k, body)
-
-    sent = [Message("/u", "Float64", START + STEP * k, named(data=float(k))) for k in range(50)]
-    found = recording("run", [*map(state, range(50)), *sent], Choice())
-    np.testing.assert_allclose(found.positions["elbow"].values, 0.01 * np.arange(50))
-    assert list(found.positions) == ["elbow"] and set(found.others["current:elbow"].values) == {2.0}
-    assert set(found.efforts["gripper"].values) == {1.0} and found.commands["elbow"].values[7] == 7.0
-
-
-def test_joints_of_several_numbers_are_positions_of_a_free_joint() -> None:
-    def pose(k: int) -> Message:
-        half, sign = 0.005 * k, -1 if k % 2 else 1
-        move = named(translation=named(x=0.1 * k, y=0.0, z=1.0),
-                     rotation=named(w=sign * np.cos(half), x=0.0, y=0.0, z=sign * np.sin(half)))  # fmt: skip
-        body = named(header=header(k), joint_names=["root"], transforms=[move], twist=[], wrench=[])
-        return Message("/multi", "MultiDOFJointState", START + STEP * k, body)
-
-    wheel = [
-        Message("/joint_states", "JointState", START + STEP * k,
-                named(header=header(k), name=["wheel"], position=[float(k)], velocity=[], effort=[]))
-        for k in range(50)
-    ]  # fmt: skip
-    sent = [Message("/u", "Float64MultiArray", START + STEP * k, named(data=[1.0])) for k in range(50)]
-    choice = Choice(commands={"/u": ("wheel",)})
-    for states in (wheel, []):
-        found = recording("run", [*map(pose, range(50)), *states, *sent], choice)
-        columns, _ = found.columns()
-        np.testing.assert_allclose(columns["position:root[0]"], 0.1 * np.arange(50))
-        np.testing.assert_allclose(columns["position:root[3]"], np.cos(0.005 * np.arange(50)))
-        assert ("position:wheel" in columns) == bool(states)
-
-
 def array_bag(swapped: bool, torque: bool) -> list[Message]:
     out = []
-    speeds = np.gradient(ANGLES, 0.01, axis=0)
-    for k in range(100):
-        body = named(header=header(k), name=list(LEG), position=list(ANGLES[k]), velocity=list(speeds[k]), effort=[])
-        out.append(Message("/joint_states", "JointState", START + STEP * k, body))
-        sent = 5 * (TARGETS - ANGLES)[k] * [1, 0, 0] - 4 * ANGLES[k] if torque else TARGETS[k]
+    for k in range(600):
+        at, t = START + STEP * k, 0.01 * k
+        q = np.array([0.3 * np.sin(3 * t), 0.5 + 0.4 * np.sin(2 * t + 1), -1.2 + 0.3 * np.cos(4.3 * t)])
+        body = named(header=stamp(at), name=list(LEG), position=list(q), velocity=[], effort=[])
+        out.append(Message("/joint_states", "JointState", at, body))
+        sent = -4 * q + 0.5 * np.sin(5 * t) if torque else q + 0.05
         sent = sent[[1, 0, 2]] if swapped else sent
-        out.append(Message("/u", "Float64MultiArray", START + STEP * k, named(data=list(sent), layout=named(dim=[]))))
+        out.append(Message("/u", "Float64MultiArray", at, named(data=list(sent), layout=named(dim=[]))))
     return out
 
 

@@ -30,7 +30,7 @@ from bayessim_mjx.logs.importers.messages import (
     Message,
     streams,
 )
-from bayessim_mjx.logs.importers.publishers import of_one_publisher, order_doubt, several_senders
+from bayessim_mjx.logs.importers.publishers import better_order, of_one_publisher, several_senders
 from bayessim_mjx.logs.importers.streams import Recording, Stream
 
 
@@ -109,7 +109,11 @@ def _sent(
         if found[0].kind == CONTROLLER:
             others |= targets(found, clock)
         if hasattr(found[0].body, "data"):
-            notes += order_doubt(name, topic, new, measured)
+            found_order = better_order(new, measured)
+            if found_order is not None:
+                given, better, why = (",".join(x) if isinstance(x, list) else x for x in found_order)
+                text = f"{name}: {topic}: the motion fits the order {better} far better than {given} ({why})"
+                notes.append(f"{text}: --commands {topic}={better}, if that is the controller's order")
         sent |= new
     return sent, others, laws, notes
 
