@@ -212,10 +212,11 @@ def test_arrays_of_an_hdf5_file_are_logs(tmp_path: Path, capsys: pytest.CaptureF
 
 
 LOW = {
-    "/lowstate": ("unitree_hg/msg/LowState", "uint32 tick\nMotorState[35] motor_state\n"),
+    "/lowstate": ("unitree_hg/msg/LowState", "uint32 tick\nIMUState imu_state\nMotorState[35] motor_state\n"),
     "/lowcmd": ("unitree_hg/msg/LowCmd", "uint8 mode_pr\nMotorCmd[35] motor_cmd\n"),
 }
 MOTORS = (
+    f"{'=' * 80}\nMSG: unitree_hg/IMUState\nfloat32[3] gyroscope\nfloat32[3] accelerometer\n"
     f"{'=' * 80}\nMSG: unitree_hg/MotorState\nuint8 mode\nfloat32 q\nfloat32 dq\nfloat32 tau_est\n"
     f"{'=' * 80}\nMSG: unitree_hg/MotorCmd\nuint8 mode\nfloat32 q\nfloat32 dq\nfloat32 tau\nfloat32 kp\nfloat32 kd\n"
 )
@@ -229,11 +230,15 @@ def test_an_mcap_file_of_unitrees_messages_is_read(tmp_path: Path, capsys: pytes
         schemas = {topic: writer.register_msgdef(kind, text + MOTORS) for topic, (kind, text) in LOW.items()}
         for k in range(80):
             q = {i: float(angle(joint, 0.005 * k)) for i, joint in NAMES.items()}
+            imu = {"gyroscope": [0.5, 0.0, 0.0], "accelerometer": [0.0, 0.0, 9.5]}
             seen = [{"mode": 1, "q": q.get(i, 0.0), "dq": 0.0, "tau_est": 0.0} for i in range(35)]
             goal = [
                 {"mode": 1, "q": 0.5 * q.get(i, 0.0), "dq": 0.0, "tau": 0.0, "kp": 30.0, "kd": 1.0} for i in range(35)
             ]
-            for topic, body in (("/lowstate", {"tick": k, "motor_state": seen}), ("/lowcmd", {"motor_cmd": goal})):
+            for topic, body in (
+                ("/lowstate", {"tick": k, "imu_state": imu, "motor_state": seen}),
+                ("/lowcmd", {"motor_cmd": goal}),
+            ):
                 writer.write_message(topic, schemas[topic], body, START + 5_000_000 * k, START + 5_000_000 * k)
         writer.finish()
     start = ("from-mcap", tmp_path / "low.mcap", "--model", model_of(tmp_path), "--out")
@@ -245,4 +250,5 @@ def test_an_mcap_file_of_unitrees_messages_is_read(tmp_path: Path, capsys: pytes
     t = 0.005 * np.arange(80)
     np.testing.assert_allclose(log.qpos, np.stack([angle(j, t) for j in JOINTS], 1), atol=1e-6)
     np.testing.assert_allclose(log.ctrl, 0.5 * log.qpos, atol=1e-6)
+    assert set(log.streams["imu.accelerometer.z"]) == {9.5} and set(log.streams["imu.gyro.x"]) == {0.5}
     assert log.metadata["controller"]["m_elbow"] == {"law": "position", "kp": 30.0, "kd": 1.0}

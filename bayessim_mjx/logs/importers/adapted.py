@@ -65,6 +65,17 @@ def low_state(message: Message, motors: Mapping[int, str]) -> Message:
     return dataclasses.replace(message, body=SimpleNamespace(name=[motors[i] for i in used], **read))
 
 
+def low_imu(messages: Sequence[Message], clock: Clock) -> dict[str, Stream]:
+    """Return the IMU of Unitree's `LowState`, where it has one, as columns `imu.gyro.x`, `imu.accelerometer.x` ..."""
+    time = np.array([clock(m) for m in messages])
+    out: dict[str, Stream] = {}
+    for field, short in (("gyroscope", "gyro"), ("accelerometer", "accelerometer")):
+        rows = [getattr(getattr(m.body, "imu_state", None), field, ()) for m in messages]
+        if all(len(row) == 3 for row in rows):
+            out |= {f"imu.{short}.{x}": Stream(time, c) for x, c in zip("xyz", np.array(rows, float).T, strict=True)}
+    return out
+
+
 def motors_of(name: str, messages: Sequence[Message], choice: Choice) -> dict[int, str]:
     """Return {number: joint} of the motors that a message numbers.
 
@@ -133,4 +144,4 @@ def enabled(messages: Sequence[Message], motors: Mapping[int, str], clock: Clock
             yield f"enabled:{joint}", Stream(time, on, "held")
 
 
-__all__ = ["dynamic", "enabled", "low_commands", "low_state", "motors_of", "multi", "other_interfaces"]
+__all__ = ["dynamic", "enabled", "low_commands", "low_imu", "low_state", "motors_of", "multi", "other_interfaces"]

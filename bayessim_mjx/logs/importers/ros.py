@@ -60,6 +60,8 @@ def recording(name: str, messages: Iterable[Message], choice: Choice) -> Recordi
     sent, others, laws, notes = _sent(name, commands, by_topic, measured, choice, clock)
     if states and by_topic[states][0].kind == DYNAMIC:
         others |= adapted.other_interfaces(by_topic[states], clock)
+    if states and by_topic[states][0].kind == LOW_STATE:
+        others |= adapted.low_imu(by_topic[states], clock)
     others |= {k: s for t in imus for k, s in _imu(t, by_topic[t], clock, len(imus) > 1).items()}
     said = [
         f"{name}: states {', '.join(filter(None, (states, *bodies)))}; commands {', '.join(commands)}",
