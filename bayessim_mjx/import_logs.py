@@ -19,6 +19,7 @@ FORMATS = {
     "from-rosbag": "ROS 1 bags (files) and ROS 2 bags (folders)",
     "from-lerobot": "data sets of LeRobot (folders)",
     "from-hdf5": "HDF5 files",
+    "from-pace": "chirps of PACE (.pt files)",
 }
 
 
@@ -43,6 +44,7 @@ def _parser() -> cli.PlainParser:
         "--episodes", metavar="N", type=int, nargs="+", help="numbers of the episodes (default: all)"
     )
     _hdf5(of["from-hdf5"])
+    of["from-pace"].add_argument("--joints", metavar="NAME", nargs="+", default=[], help="columns of the joints")
     for name in ("from-lerobot", "from-hdf5"):
         _units(of[name])
     return parser
@@ -65,6 +67,8 @@ def _ros(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--field", choices=("position", "velocity", "effort"), help=text)
     text = "which publisher of the joint states, from 1, where a refusal numbers several"
     parser.add_argument("--publisher", metavar="N", type=int, help=text)
+    text = "joints in the order of the motors, of messages that number them, as Unitree's LowState"
+    parser.add_argument("--joints", metavar="NAME", nargs="+", default=[], help=text)
     text = "times of headers, or when messages were received (default: header)"
     parser.add_argument("--stamps", choices=("header", "received"), default="header", help=text)
 
@@ -94,13 +98,15 @@ def _pairs(given: Sequence[str]) -> dict[str, str]:
 
 
 def _choice(args: argparse.Namespace, model: Any) -> "Choice":
+    from bayessim_mjx.logs import vendors
     from bayessim_mjx.logs.importers.ros import Choice
 
     topics = (text.partition("=") for text in args.commands)
     commands = {topic: [n for n in names.split(",") if n] for topic, _, names in topics}
     # the bias of a position servo pulls its joint back by the gain
     targets = model is not None and model.nu > 0 and bool((model.actuator_biasprm[:, 1] < 0).all())
-    return Choice(args.states, commands or None, args.field, args.stamps, args.publisher, targets)
+    names = vendors.hinges(model) if model is not None else ()
+    return Choice(args.states, commands or None, args.field, args.stamps, args.publisher, targets, args.joints, names)
 
 
 def _recordings(args: argparse.Namespace, model: Any) -> Iterator["Recording"]:
@@ -115,6 +121,10 @@ def _recordings(args: argparse.Namespace, model: Any) -> Iterator["Recording"]:
             from bayessim_mjx.logs.importers import hdf5
 
             yield from hdf5.recordings(path, _arrays(args))
+        elif args.format == "from-pace":
+            from bayessim_mjx.logs.importers import pace
+
+            yield pace.of_file(path, args.joints)
         else:
             from bayessim_mjx.logs.importers import ros, ros_files
 
@@ -134,7 +144,7 @@ def _arrays(args: argparse.Namespace) -> Any:
 
 
 def _logs(argv: Sequence[str] | None) -> int:
-    """Recordings of other tools as a folder of logs; exit code 0, or 2 (bad input)."""
+    """Convert recordings of other tools to a folder of logs, or check logs; exit code 0, or 2 (bad input)."""
     args = _parser().parse_args(argv)
     if args.format == "check":
         return _checked(args)

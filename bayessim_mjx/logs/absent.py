@@ -47,7 +47,7 @@ def filled(
 
 
 def _known(table: Table, channels: Channels) -> None:
-    """A column of a joint that the model lacks is a wrong name, not a joint without an encoder."""
+    """Refuse columns of joints that the model lacks: a wrong name, not a joint without an encoder."""
     for stream, allowed in (("qpos", channels.qpos), ("qvel", channels.qvel)):
         for column in table.columns:
             if column.startswith(f"{stream}:") and column.partition(":")[2] not in allowed:

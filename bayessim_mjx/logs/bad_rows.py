@@ -1,4 +1,4 @@
-"""Rows that cannot be used: refused, left out, or kept for what else they hold (`bad_rows` in a map), and counted."""
+"""Rows that cannot be used (`bad_rows` in a map), that a recorder wrote twice, or that stand in reverse order."""
 
 from __future__ import annotations
 
@@ -69,3 +69,43 @@ def _tell(
         first = min(set(unreadable) - set(bad))
         texts += [f"fields of {missing} row(s) count as missing, first {table.where(first)}: {unreadable[first]}"]
     warnings.warn(f"{table.path}: bad_rows: {policy}: {'; '.join(texts)}", stacklevel=4)
+
+
+def oldest_first(table: Table, columns: dict[str, Array]) -> tuple[Table, dict[str, Array]]:
+    """Table and columns [T] with the rows in the order of time, where they stand newest first, with a warning."""
+    steps = np.diff(columns["time"])
+    seen = steps[np.isfinite(steps)]
+    if not len(seen) or not ((seen <= 0).all() and (seen < 0).any()):
+        return table, columns
+    last = table.rows - 1
+    warnings.warn(
+        f"{table.path}: the rows stand newest row first; they are read from the last to the first", stacklevel=4
+    )
+    changed = dataclasses.replace(
+        table,
+        columns={name: column[::-1] for name, column in table.columns.items()},
+        ragged={last - row: why for row, why in table.ragged.items()},
+        kept=[table.row(row) for row in range(last, -1, -1)],
+    )
+    return changed, {name: column[::-1] for name, column in columns.items()}
+
+
+def without_copies(table: Table, columns: dict[str, Array]) -> tuple[Table, dict[str, Array]]:
+    """Table and columns [T] without rows that repeat the row before them, with a warning that counts them.
+
+    Rows with the same stamp and another value stay, and are refused later: nothing says which of them holds.
+    """
+    time = columns["time"]
+    if len(time) < 2 or (np.diff(time) != 0).all():
+        return table, columns
+    every = np.stack(list(columns.values()), 1)
+    same = (every[1:] == every[:-1]) | (np.isnan(every[1:]) & np.isnan(every[:-1]))
+    copies = np.r_[False, same.all(axis=1)]
+    if not copies.any() or copies.all():
+        return table, columns
+    first = int(np.flatnonzero(copies)[0])
+    text = f"{table.path}: {int(copies.sum())} row(s) repeat the row before them, first {table.where(first)}"
+    warnings.warn(f"{text}; each counts once", stacklevel=4)
+    kept = np.flatnonzero(~copies)
+    lines = [table.row(int(row)) for row in kept]
+    return dataclasses.replace(table, kept=lines), {name: column[kept] for name, column in columns.items()}

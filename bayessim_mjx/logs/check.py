@@ -61,7 +61,7 @@ def check_names(table: Table, columns: Mapping[str, Array], channels: Channels) 
 
 
 def check_finite(table: Table, columns: Mapping[str, Array], channels: Channels) -> None:
-    """What is needed is finite.
+    """Refuse what is needed and not finite.
 
     Raises:
         UserError: NaN, infinity, or a number too large to compute with.
@@ -75,12 +75,14 @@ def check_finite(table: Table, columns: Mapping[str, Array], channels: Channels)
 
 
 def _mend_of(time: Array) -> str:
-    """The key of the map for stamps that stand still or run back."""
+    """Name the key of the map for stamps that stand still or run back."""
     grain = coarseness(time)
     if grain:
         rate = round((len(time) - 1) / max(float(time[-1] - time[0]), 1e-9), 3)
         text = f"; the stamps are {grain:g} s apart and many rows share each, about {rate:g} rows per second"
         return f"{text}: `time: {{column: ..., rate: ROWS_PER_SECOND}}` in a map spaces them evenly"
+    if len(time) and (time == time[0]).all():
+        return "; the stamps stand still, as where a program rounded them: `rate: ROWS_PER_SECOND` in place of `time`"
     lost = float(np.mean(time < np.maximum.accumulate(time)))
     if lost > 0.05:
         return f"; a clock that begins anew ({percent(lost)} of the rows come after it): cut the file there into two"

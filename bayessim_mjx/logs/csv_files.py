@@ -1,4 +1,4 @@
-"""CSV files as tables: delimiter, header, lines of units, and the marks in their numbers."""
+"""CSV files as tables, and how a file is written, guessed for a map: delimiter, header, lines of units, marks."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.numerals import marks_of
 from bayessim_mjx.logs.table import Table
-from bayessim_mjx.logs.texts import lines_of, named_delimiter
+from bayessim_mjx.logs.texts import lines_of, marks_of, named_delimiter
 
 ALLOWED = "allowed: CSV with a header line, or NPZ"
 DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
@@ -24,7 +24,7 @@ class Form:
         delimiter: one character. header: whether there is a line of names.
         skip_rows: lines before the header, or before the first row where there is none; of all text files.
         skip_after_header: lines between the header and the first row.
-        encoding: of all text files; decimal, thousands: marks in numbers (`numerals.Marks`); None: found in the file.
+        encoding: of all text files; decimal, thousands: marks in numbers (`texts.Marks`); None: found in the file.
         lenient: a row of the wrong length becomes one that holds nothing (`bad_rows`).
     """
 
@@ -52,7 +52,7 @@ def read_csv(path: Path, form: Form = Form()) -> Table:  # noqa: B008  # immutab
     text, skipped = (text[1:], 1) if own else (text, form.skip_rows)
     delimiter = own or form.delimiter
     try:
-        lines = list(csv.reader(text, delimiter=delimiter))
+        lines = list(csv.reader(text, delimiter=delimiter, skipinitialspace=not delimiter.isspace()))
     except csv.Error as error:
         raise UserError(f"{path}: not a text file ({error}); {ALLOWED}") from None
     if delimiter == " ":
@@ -60,6 +60,8 @@ def read_csv(path: Path, form: Form = Form()) -> Table:  # noqa: B008  # immutab
     while lines and not any(f.strip() for f in lines[-1]):
         lines.pop()
     body = lines[1 + form.skip_after_header :] if form.header else lines[form.skip_after_header :]
+    kept = [row for row, fields in enumerate(body) if any(f.strip() for f in fields) or len(fields) == len(lines[0])]
+    body = [body[row] for row in kept]  # lines that hold nothing at all are no rows
     if not body:
         raise UserError(f"{path}: no data rows; allowed: a header line and one row per sample")
     names = [f.strip().lstrip("#").strip() for f in lines[0]] if form.header else [str(i) for i in range(len(body[0]))]
@@ -76,16 +78,16 @@ def read_csv(path: Path, form: Form = Form()) -> Table:  # noqa: B008  # immutab
     ragged = {row: f"{len(fields)} fields" for row, fields in enumerate(body) if len(fields) != len(names)}
     if ragged and not form.lenient:
         row = min(ragged)
-        at = f"{path}: line {row + first} has {ragged[row]}; allowed: {len(names)} ({', '.join(names)})"
+        at = f"{path}: line {kept[row] + first} has {ragged[row]}; allowed: {len(names)} ({', '.join(names)})"
         raise UserError(at + _why_ragged(text, body, names, delimiter, ragged))
     if form.header and not form.lenient:
-        _units_row(path, body, first)
+        _units_row(path, body, first + kept[0])
     body = [[""] * len(names) if row in ragged else fields for row, fields in enumerate(body)]
     marks = marks_of(body, form.decimal, form.thousands)
     columns = {name: [r[i] for r in body] for i, name in enumerate(names)}
     blank = {names[i] for i in unnamed if not any(r[i].strip() for r in body)}
     columns = {name: column for name, column in columns.items() if name not in blank}
-    return Table(path, columns, first, lenient=form.lenient, ragged=ragged, marks=marks)
+    return Table(path, columns, first, lenient=form.lenient, ragged=ragged, marks=marks, kept=kept)
 
 
 def _in_blanks(text: Sequence[str], lines: list[list[str]]) -> list[list[str]]:
@@ -115,14 +117,14 @@ def _other_delimiter(path: Path, names: Sequence[str], lines: Sequence[Sequence[
 
 
 def _no_header(path: Path, fields: Sequence[str], names: Sequence[str]) -> None:
-    """A first line of numbers with fractions is no header; whole numbers may be names."""
+    """Refuse a first line of numbers with fractions as a header; whole numbers may be names."""
     if all(map(is_number, names)) and not all(name.lstrip("+-").isdigit() for name in names):
         text = f"{path}: the first line ({', '.join(fields[:4])} ...) holds numbers, not names"
         raise UserError(f"{text}; `header: false` in a map numbers the columns from 0, and keeps that line as a row")
 
 
 def _units_row(path: Path, body: Sequence[Sequence[str]], first: int) -> None:
-    """A line of words above lines of numbers is a line of units."""
+    """Refuse a line of words above lines of numbers: it is a line of units."""
     if len(body) < 3:
         return
     words = [not is_number(f) and bool(f.strip()) for f in body[0]]
@@ -136,7 +138,7 @@ def _units_row(path: Path, body: Sequence[Sequence[str]], first: int) -> None:
 def _why_ragged(
     text: Sequence[str], body: Sequence[Sequence[str]], names: Sequence[str], delimiter: str, ragged: Mapping[int, str]
 ) -> str:
-    """What may be behind rows of other lengths, and the keys that mend it."""
+    """Name the likely cause of rows of other lengths, and the keys that mend it."""
     if delimiter == "," and len(ragged) == len(body) and all(len(fields) == 2 * len(names) for fields in body):
         return (
             "; each row has twice as many: commas separate the fields and are decimal marks too, and the two cannot be "
@@ -158,4 +160,59 @@ def is_number(text: str) -> bool:
     return True
 
 
-__all__ = ["DELIMITERS", "Form", "is_number", "read_csv"]
+HEAD = 200  # lines that are looked at; rule of thumb, not measured
+MOST = 0.9  # share of the lines that have to have the same number of fields; rule of thumb, not measured
+
+
+def form_of(path: Path) -> dict[str, Any]:
+    """Keys of a map, with what differs from a plain CSV file: delimiter, skip_rows, header, skip_after_header.
+
+    Raises:
+        UserError: bytes of an unknown encoding.
+    """
+    lines = lines_of(path, None, ALLOWED)[:HEAD]
+    if not lines or named_delimiter(lines[0]):
+        return {}
+    marks = {mark: _table(lines, mark) for mark in (",", *DELIMITERS)}
+    best = max(marks, key=lambda mark: _score(marks[mark]))
+    rows = marks[best]
+    width = _width(rows)
+    if width < 2:
+        return {}
+    first = next(i for i, row in enumerate(rows) if len(row) == width)
+    out: dict[str, Any] = {} if best == "," else {"delimiter": best}
+    if first:
+        out["skip_rows"] = first
+    if all(map(is_number, rows[first])) and not all(f.strip().lstrip("+-").isdigit() for f in rows[first]):
+        out["header"] = False
+    elif len(rows) > first + 2 and not any(map(is_number, rows[first + 1])) and any(map(is_number, rows[first + 2])):
+        out["skip_after_header"] = 1
+    return out
+
+
+def _table(lines: Sequence[str], mark: str) -> list[list[str]]:
+    if mark == " ":  # in runs, and `# ` may stand before the names
+        return [[part for i, part in enumerate(line.split()) if i or part != "#"] for line in lines]
+    try:
+        return list(csv.reader(lines, delimiter=mark))
+    except csv.Error:
+        return []
+
+
+def _width(rows: Sequence[Sequence[str]]) -> int:
+    """Fields of the most common kind of row."""
+    counts = [len(row) for row in rows if row]
+    return max(set(counts), key=counts.count) if counts else 0
+
+
+def _score(rows: Sequence[Sequence[str]]) -> float:
+    """Share of the fields that are numbers in rows of the same length; 0 where rows differ."""
+    width = _width(rows)
+    same = [row for row in rows if len(row) == width]
+    if width < 2 or len(same) < MOST * len([row for row in rows if row]) - 12:
+        return 0.0
+    fields = [field for row in same for field in row]
+    return sum(map(is_number, fields)) / len(fields) + 1e-3 * min(width, 50)
+
+
+__all__ = ["DELIMITERS", "Form", "form_of", "is_number", "read_csv"]

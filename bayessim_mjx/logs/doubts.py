@@ -13,11 +13,12 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import units
 from bayessim_mjx.logs.log import Array, Channels
 from bayessim_mjx.logs.mapping import LogMap, Source
+from bayessim_mjx.logs.signals import LEVELS, values_shown
 from bayessim_mjx.logs.table import Table
 from bayessim_mjx.logs.turns import TURN, servos
 
 DEGREE = units.ANGLES["deg"]
-PLAIN = ("rad", "m", "rad/s", "m/s", "N m", "N", None)
+PLAIN = ("rad", "m", "rad/s", "m/s", "N m", "N", "V", units.PLAIN, None)
 # Rules of thumb. Of 60 files in degrees 30 are refused and 28 warned of: benchmarks/records/log_checks.json
 FAR = 3.0  # times a joint's range, which readings in the model's unit never reach, however loose the range is
 ALIKE = 0.8  # correlation from which a joint follows its target; rule of thumb, see FAR
@@ -59,6 +60,8 @@ def check_units(
             _by_range(table, name, columns[name], kind, *map(float, model.jnt_range[j]))
         elif kind == "hinge" and name in unstated:
             _many_turns(table, name, columns[name])
+        if kind in ("hinge", "slide") and name in unstated:
+            _by_counting(table, name, columns[name], kind)
     for i, j in followed.items():
         pair = f"qpos:{channels.joints[j]}", f"ctrl:{channels.actuators[i]}"
         if unstated & set(pair):
@@ -85,8 +88,13 @@ def _by_name(
     table: Table, log_map: LogMap, name: str, source: Source, followed: Mapping[int, int], channels: Channels
 ) -> None:
     column = source.name(table, name)
-    unit = units.of_name(column)
+    unit = units.of_name(f"[{source.suffix.strip()}]") if source.suffix.strip() else units.of_name(column)
     stream, _, own = name.partition(":")
+    strange = units.foreign(column)
+    if strange is not None and not source.stated and column != name and own not in strange:
+        text = f"{table.path}: column {column!r}: nothing is known of {strange!r}, which may be its unit"
+        key = f"`{stream}: {{{own}: {{column: {column!r}, scale: MODEL_UNITS_PER_UNIT}}}}`"
+        raise UserError(f"{text}; state `unit` or `scale` in a map: {key}; `scale: 1` if it is none")
     if source.stated or column == name or unit in PLAIN or unit in units.TIMES:
         return
     if stream == "ctrl":
@@ -125,6 +133,16 @@ def _many_turns(table: Table, name: str, x: Array) -> None:
         warnings.warn(f"{text}; degrees would need {_key(name, name, 'deg')} in a map", stacklevel=5)
 
 
+def _by_counting(table: Table, name: str, x: Array, kind: str) -> None:
+    """Refuse a joint that moves from whole number to whole number: its unit is neither rad nor m."""
+    if not _whole(x) or values_shown(x) < LEVELS:
+        return
+    own, others = ("rad", (units.COUNTS, "deg")) if kind == "hinge" else ("m", ("mm", units.PERCENT))
+    keys = " or ".join(_key(name, name, unit) for unit in others)
+    text = f"{table.path}: column {name!r} holds whole numbers alone, from {x.min():g} to {x.max():g} {own}"
+    raise UserError(f"{text}; state its unit in a map: {keys}, or `unit: {own}` if they are in {own} all the same")
+
+
 def _whole(x: Array) -> bool:
     return bool((x == np.round(x)).all())
 
@@ -151,17 +169,27 @@ def _fitting(x: Array, kind: str, low: float, high: float) -> list[str]:
 
 
 def _by_target(table: Table, reading: str, target: str, columns: Mapping[str, Array]) -> None:
-    """A joint that follows its target with about 57 times its amplitude, or a 57th: one of the two is in degrees."""
+    """Find a joint that follows its target with the amplitude of another unit, of a gear, or mirrored."""
     q, c = columns[reading], columns[target]
-    if not (np.ptp(q) > 0 and np.ptp(c) > 0) or np.corrcoef(q, c)[0, 1] < ALIKE:
+    if not (np.ptp(q) > 0 and np.ptp(c) > 0):
+        return
+    alike, unwrapped = (float(np.corrcoef(a, b)[0, 1]) for a, b in ((q, c), (np.unwrap(q), np.unwrap(c))))
+    if max(alike, unwrapped) < -ALIKE:
+        stream, _, own = reading.partition(":")
+        text = f"{table.path}: {reading!r} goes against {target!r} (correlation {alike:.3f}), as if it were mirrored"
+        key = f"`{stream}: {{{own}: {{column: {reading!r}, sign: -1}}}}`"
+        raise UserError(f"{text}; state {key} in a map, or `unit: rad` of both if they are right")
+    if alike < ALIKE:
         return
     ratio = float(np.std(q) / np.std(c))
-    for name, factor in ((reading, ratio * DEGREE), (target, DEGREE / ratio)):
-        if 1.0 / RATIO < factor < RATIO:
-            text = f"{table.path}: {reading!r} follows {target!r} with {ratio:.4g} times its amplitude"
-            raise UserError(
-                f"{text}: {name!r} may be in degrees; state {_key(name, name, 'deg')} in a map, or `unit: rad` if not"
-            )
+    text = f"{table.path}: {reading!r} follows {target!r} with {ratio:.4g} times its amplitude"
+    for unit, scale in units.ANGLES.items():
+        for name, factor in ((reading, ratio * scale), (target, scale / ratio)):
+            if unit != "rad" and 1.0 / RATIO < factor < RATIO:
+                text = f"{text}: {name!r} may be in {unit}; state {_key(name, name, unit)} in a map"
+                raise UserError(f"{text}, or `unit: rad` if not")
+    if not 1.0 / FAR < ratio < FAR:
+        warnings.warn(f"{text}; `scale` of one of them in a map takes out a gear or another unit", stacklevel=4)
 
 
 __all__ = ["check_units"]

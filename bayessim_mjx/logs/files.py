@@ -1,4 +1,4 @@
-"""Which files are logs: paths and folders, a folder's map, and the metadata that lie beside a file."""
+"""Files of logs: those of a folder, its map, the metadata beside a file, and logs in the library's own format."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bayessim_mjx.config import read_yaml
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.mapping import LogMap
 
 METADATA = (
@@ -27,7 +30,7 @@ Paths = str | Path | Sequence[str | Path]
 
 
 def map_of_folder(paths: Paths) -> Path | None:
-    """The `map.yaml` of the one folder that is given, if it has one."""
+    """Return the `map.yaml` of the one folder that is given, if it has one."""
     given = _listed(paths)
     own = given[0] / "map.yaml" if len(given) == 1 else None
     return own if own is not None and own.is_file() else None
@@ -75,7 +78,7 @@ def distinct(files: Sequence[Path]) -> list[Path]:
 
 
 def side_yaml(path: Path) -> Mapping[str, Any]:
-    """The metadata beside a log: `run1.yaml` of `run1.csv`; a warning for a key that looks misspelt."""
+    """Read the metadata beside a log: `run1.yaml` of `run1.csv`; warn of a key that looks misspelt."""
     side = path.with_suffix(".yaml")
     content = read_yaml(side) if side.is_file() and side.name != "map.yaml" else {}
     for key in content:
@@ -83,3 +86,43 @@ def side_yaml(path: Path) -> Mapping[str, Any]:
         if key not in METADATA and near and near[0] not in content:
             warnings.warn(f"{side}: key {key!r} has no meaning here; did you mean {near[0]!r}?", stacklevel=5)
     return content
+
+
+def write_log(path: str | Path, log: Log, velocity: bool | None = None) -> Path:
+    """Write one log; `velocity` (default: where measured) says whether qvel goes into the file.
+
+    Raises:
+        UserError: a suffix that is neither .csv nor .npz.
+    """
+    path = Path(path)
+    with_qvel = log.has_qvel if velocity is None else velocity
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".npz":
+        arrays: dict[str, Any] = {"time": log.time, "ctrl": log.ctrl, "qpos": log.qpos} | (
+            {"qvel": log.qvel} if with_qvel else {}
+        )
+        names = {"joints": np.array(log.joints), "actuators": np.array(log.actuators)}
+        np.savez(path, **(arrays | names | dict(log.streams)))
+    elif path.suffix == ".csv":
+        table = _columns(log, with_qvel)
+        np.savetxt(
+            path,
+            np.stack(list(table.values()), 1),
+            ["%.12g"] + ["%.9g"] * (len(table) - 1),
+            ",",
+            header=",".join(table),
+            comments="",
+        )
+    else:
+        raise UserError(f"{path}: unknown kind of file {path.suffix!r}; allowed: .csv, .npz")
+    return path
+
+
+def _columns(log: Log, with_qvel: bool) -> dict[str, Array]:
+    table: dict[str, Array] = {"time": log.time}
+    blocks = {"ctrl": (log.channels.actuators, log.ctrl), "qpos": (log.channels.qpos, log.qpos)}
+    if with_qvel:
+        blocks["qvel"] = (log.channels.qvel, log.qvel)
+    for stream, (names, values) in blocks.items():
+        table.update({f"{stream}:{n}": c for n, c in zip(names, values.T, strict=True)})
+    return {name: column for name, column in (table | dict(log.streams)).items() if name not in log.absent}

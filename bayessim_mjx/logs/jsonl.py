@@ -14,7 +14,9 @@ from bayessim_mjx.logs.texts import lines_of
 ALLOWED = 'allowed: one object per line, as {"time": 0.01, "ctrl": {"motor": 1.2}, "qpos": {"elbow": 0.3}}'
 
 
-def read_jsonl(path: Path, skip_rows: int = 0, lenient: bool = False, encoding: str | None = None) -> Table:
+def read_jsonl(
+    path: Path, skip_rows: int = 0, lenient: bool = False, encoding: str | None = None, decimal: str | None = None
+) -> Table:
     """Read JSON lines: `{"qpos": {"elbow": 1}}` is the column `qpos:elbow`, `{"q": [1, 2]}` are `q[0]` and `q[1]`.
 
     A key that a line lacks, or null, is a blank field. Empty lines are passed over.
@@ -22,7 +24,7 @@ def read_jsonl(path: Path, skip_rows: int = 0, lenient: bool = False, encoding: 
     Args:
         skip_rows: lines before the first sample.
         lenient: a line that is no object becomes a row that holds nothing (`bad_rows`).
-        encoding: as the map states it, or None.
+        encoding: as the map states it, or None. decimal: the mark in texts that hold numbers.
 
     Raises:
         UserError: a line that is no object, two keys that name the same column, no sample.
@@ -35,7 +37,7 @@ def read_jsonl(path: Path, skip_rows: int = 0, lenient: bool = False, encoding: 
         if not line.strip():
             continue
         try:
-            row = _row(line, f"{path}: line {number}")
+            row = _row(line, f"{path}: line {number}", decimal == ",")
         except UserError as error:
             if not lenient:
                 raise
@@ -49,7 +51,7 @@ def read_jsonl(path: Path, skip_rows: int = 0, lenient: bool = False, encoding: 
     return Table(path, columns, 1, lenient=lenient, ragged=ragged, kept=[number - 1 for number in at])
 
 
-def _row(line: str, where: str) -> dict[str, str]:
+def _row(line: str, where: str, commas: bool) -> dict[str, str]:
     try:
         content = json.loads(line)
     except ValueError as error:
@@ -57,19 +59,21 @@ def _row(line: str, where: str) -> dict[str, str]:
     if not isinstance(content, dict):
         raise UserError(f"{where}: {type(content).__name__} in place of an object; {ALLOWED}")
     out: dict[str, str] = {}
-    for name, value in _flat("", content):
+    for name, value in _flat("", content, commas):
         if name in out:
             raise UserError(f"{where}: two values of {name!r}; allowed: one value per column")
         out[name] = value
     return out
 
 
-def _flat(name: str, value: Any) -> Iterator[tuple[str, str]]:
+def _flat(name: str, value: Any, commas: bool) -> Iterator[tuple[str, str]]:
     if isinstance(value, dict):
         for key, inner in value.items():
-            yield from _flat(f"{name}:{key}" if name else key, inner)
+            yield from _flat(f"{name}:{key}" if name else key, inner, commas)
     elif isinstance(value, list):
         for i, inner in enumerate(value):
-            yield from _flat(f"{name}[{i}]", inner)
+            yield from _flat(f"{name}[{i}]", inner, commas)
+    elif commas and isinstance(value, str):
+        yield name, value.replace(",", ".")
     else:
         yield name, "" if value is None else repr(value) if isinstance(value, float) else str(value)

@@ -190,7 +190,7 @@ class Log:
         return float(self.metadata.get("commands_late", 0.0))
 
     def shifted(self, late: float) -> Log:
-        """The log with commands that act `late` s later than they did, without a change of its rows."""
+        """Return the log with commands that act `late` s later than they did, without a change of its rows."""
         return replace(self, metadata={**self.metadata, "commands_late": self.late + late})
 
     @property
@@ -213,7 +213,7 @@ class Log:
 
 
 def suggest(name: str, allowed: Iterable[str]) -> str:
-    """The tail of an error message: the close matches first, then everything that is allowed."""
+    """Return the tail of an error message: the close matches first, then everything that is allowed."""
     names = list(allowed)
     close = difflib.get_close_matches(name, names, n=2, cutoff=0.5)
     hint = f"did you mean {' or '.join(map(repr, close))}? " if close else ""

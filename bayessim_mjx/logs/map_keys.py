@@ -43,7 +43,7 @@ _BELOW = {"signed": (2, 64), "sign_magnitude": (1, 62), "skip_rows": (0, 10**9),
 
 
 def plain(path: str, key: str, value: Any) -> Any:
-    """The value, if it has the kind that its key needs (a number, where nothing else is said).
+    """Return the value, if it has the kind that its key needs (a number, where nothing else is said).
 
     Raises:
         UserError: another kind, or a value that is not among those allowed; names the map, the key and what is allowed.
@@ -90,7 +90,7 @@ def _fits_text(key: str, value: Any) -> bool:
 
 
 def source_keys(path: str, key: str, block: Mapping[str, Any], allowed: Iterable[str]) -> None:
-    """That the keys of one channel are known and go together.
+    """Check that the keys of one channel are known and go together.
 
     Raises:
         UserError: an unknown key, neither a column nor a value, a unit without what it needs, two keys for one thing.

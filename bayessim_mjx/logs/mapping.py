@@ -13,6 +13,7 @@ from bayessim_mjx.config import read_yaml
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import stamps
 from bayessim_mjx.logs.csv_files import Form
+from bayessim_mjx.logs.instants import MEND
 from bayessim_mjx.logs.log import Array, suggest
 from bayessim_mjx.logs.map_keys import plain, source_keys
 from bayessim_mjx.logs.table import Table
@@ -74,7 +75,7 @@ class Source:
         return self.sign * scale, self.offset
 
     def read(self, table: Table, where: str) -> Array:
-        """The channel [T] from the table.
+        """Return the channel [T] from the table.
 
         Raises:
             UserError: no such column, a field that is no number or does not fit the register.
@@ -113,7 +114,7 @@ class Source:
         return np.where(fits, np.where(raw >= half, half - raw, raw), np.nan)
 
     def name(self, table: Table, where: str) -> str:
-        """The column's name in the table.
+        """Return the column's name in the table.
 
         Raises:
             UserError: no such column.
@@ -122,7 +123,7 @@ class Source:
 
 
 def column_of(table: Table, column: str | int | None, where: str) -> str:
-    """The name in the table of a column that is given by its name or its index from 0.
+    """Return the name in the table of a column that is given by its name or its index from 0.
 
     Raises:
         UserError: no such column.
@@ -165,14 +166,20 @@ class Clock(Source):
         return raw if self.rate is None else stamps.even(raw, self.rate, table, name)
 
     def _numbers(self, table: Table, name: str, where: str) -> Array:
-        raw = self.decoded(table.numbers(name), table, name)
+        try:
+            raw = table.numbers(name, self.suffix)
+        except UserError as error:
+            raise UserError(f"{error}{MEND}") from None
+        if self.wrap is None:
+            stamps.check_counter(raw, table, name)
+        raw = self.decoded(raw, table, name)
         if self.nanoseconds is not None:
             more = table.numbers(column_of(table, self.nanoseconds, where))
             return self.factors()[0] * raw + 1e-9 * more + self.offset
         if self.stated:
             scale, offset = self.factors()
             return scale * (raw - self.zero) + offset
-        return stamps.seconds_of(raw, table, name) + self.offset
+        return stamps.seconds_of(raw, table, name, self.suffix) + self.offset
 
 
 @dataclass(frozen=True)
@@ -238,7 +245,7 @@ class LogMap:
         return bool(self.ctrl or self.qpos or self.qvel or self.streams)
 
     def clock(self, table: Table) -> Array:
-        """The times of the rows [T], s.
+        """Return the times of the rows [T], s.
 
         Raises:
             UserError: no such column, a field that is no time.

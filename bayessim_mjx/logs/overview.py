@@ -16,21 +16,24 @@ import yaml
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import units
 from bayessim_mjx.logs.check import needed_columns
+from bayessim_mjx.logs.csv_files import form_of
 from bayessim_mjx.logs.files import SUFFIXES, map_of_folder
-from bayessim_mjx.logs.log import Array, Channels
+from bayessim_mjx.logs.importers.publishers import better_order
+from bayessim_mjx.logs.importers.streams import Stream
+from bayessim_mjx.logs.log import Array, Channels, Log
 from bayessim_mjx.logs.mapping import LogMap, Source
 from bayessim_mjx.logs.pieces import MAX_GAP, SHORT_GAP
-from bayessim_mjx.logs.proposal import Proposal, native, propose
+from bayessim_mjx.logs.proposal import Proposal, drives, native, propose
 from bayessim_mjx.logs.read import read_logs, table_of
-from bayessim_mjx.logs.sniffing import form_of
 from bayessim_mjx.logs.table import Table
+from bayessim_mjx.logs.vendors import hinges
 
 HEAD = """# Proposed from the names of the columns; look through it, and edit it (docs/logs.md).
 # A channel is `name: column`, or `name: {column: ..., unit: deg, sign: -1, offset: 0.1}`.
 """
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc")
 CONVERTED = {".mcap": "from-mcap", ".bag": "from-rosbag", ".db3": "from-rosbag", ".parquet": "from-lerobot",
-             ".hdf5": "from-hdf5", ".h5": "from-hdf5"}  # fmt: skip
+             ".hdf5": "from-hdf5", ".h5": "from-hdf5", ".pt": "from-pace"}  # fmt: skip
 
 
 @dataclass
@@ -100,7 +103,7 @@ def _files(path: Path, log_map: LogMap | None) -> list[Path]:
 
 
 def _proposed(out: Overview, files: Sequence[Path], model: mujoco.MjModel | None) -> LogMap:
-    """The map that the first file suggests; its text goes into the overview."""
+    """Return the map that the first file suggests; its text goes into the overview."""
     first = files[0]
     content: dict[str, Any] = {"files": f"*{first.suffix}"}
     try:
@@ -110,7 +113,9 @@ def _proposed(out: Overview, files: Sequence[Path], model: mujoco.MjModel | None
     except UserError as error:
         out.missing.append(str(error))
         return LogMap.read(content)
-    found = Proposal() if first.suffix == ".npz" or native(table.columns) else propose(list(table.columns), model)
+    found = (
+        Proposal() if first.suffix == ".npz" or native(table.columns) else propose(list(table.columns), model, table)
+    )
     plain = found.time == "time" and not (found.ctrl or found.qpos or found.qvel or found.streams)
     content |= {} if plain else found.blocks()
     out.notes += found.questions
@@ -212,7 +217,7 @@ def _column(
 
 
 def _how(source: Source) -> str:
-    """What the map does to the column."""
+    """Say how the map changes the column."""
     keys = ("scale", "sign", "zero", "offset", "resolution", "range", "torque_constant", "signed", "sign_magnitude",
             "wrap", "rate", "format")  # fmt: skip
     plain = Source()
@@ -238,14 +243,32 @@ def _clock(time: Array | None, log_map: LogMap) -> tuple[str, ...]:
 
 
 def _read(out: Overview, files: Sequence[Path], log_map: LogMap, model: mujoco.MjModel) -> None:
-    """Reads the logs as a diagnosis does; its warnings are notes, its refusal is what is missing."""
+    """Read the logs as a diagnosis does; its warnings are notes, its refusal is what is missing."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            read_logs(files, model, log_map, partial=True)
+            logs = read_logs(files, model, log_map, partial=True)
+            out.notes += list(dict.fromkeys(text for log in logs if (text := _order(log, model))))
         except UserError:
             out.missing += [text for text in (_refusal(file, log_map, model) for file in files) if text]
     out.notes += list(dict.fromkeys(str(w.message) for w in said))
+
+
+def _order(log: Log, model: mujoco.MjModel) -> str:
+    """Say which other order of the commands fits the motion far better, if one does."""
+    drive_of = {j: own[0] for j in hinges(model) if len(own := drives(model, log.joints.index(j))) == 1}
+    kinds = {"position": (log.qpos, log.channels.qpos, "qpos"), "velocity": (log.qvel, log.channels.qvel, "qvel")}
+    measured = {
+        kind: {j: Stream(log.time, x[:, names.index(j)]) for j in drive_of if f"{stream}:{j}" not in log.absent}
+        for kind, (x, names, stream) in kinds.items()
+    }
+    sent = {j: Stream(log.time, log.ctrl[:, i], "held") for j, i in drive_of.items()}
+    found = better_order(sent, {**measured, "effort": {}})
+    if found is None:
+        return ""
+    given, better = ([log.actuators[drive_of[j]] for j in order] for order in found[:2])
+    text = f"the commands {', '.join(given)} fit the motion far better as those of {', '.join(better)} ({found[2]})"
+    return f"{text}; `ctrl` in the map says which column is whose"
 
 
 def _refusal(file: Path, log_map: LogMap, model: mujoco.MjModel) -> str:

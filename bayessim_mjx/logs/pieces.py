@@ -29,7 +29,7 @@ def pieces(
     metadata: Mapping[str, Any],
     absent: tuple[str, ...] = (),
 ) -> list[Log]:
-    """The file as one log, or as several where samples are missing for long.
+    """Return the file as one log, or as several where samples are missing for long.
 
     Args:
         table: the file; columns: its channels; metadata: of its logs.
@@ -111,7 +111,7 @@ def _log(
 
 
 def _known(metadata: Mapping[str, Any], key: str, columns: Mapping[str, Array], channels: Channels) -> dict[str, float]:
-    """Declared noise or quantum per column; `<joint>` is short for `qpos:<joint>`."""
+    """Read the declared noise or quantum per column; `<joint>` is short for `qpos:<joint>`."""
     given, source = metadata.get(key) or {}, metadata["source"]
     if not isinstance(given, Mapping):
         raise UserError(f"{source}: {key} = {given!r} in its side YAML; allowed: a mapping '<channel>: value'")

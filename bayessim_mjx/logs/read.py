@@ -13,11 +13,10 @@ import numpy as np
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.absent import filled
-from bayessim_mjx.logs.bad_rows import leave_out
+from bayessim_mjx.logs.bad_rows import leave_out, oldest_first, without_copies
 from bayessim_mjx.logs.check import STREAMS, check_finite, check_motion, check_names, check_time
 from bayessim_mjx.logs.csv_files import read_csv
 from bayessim_mjx.logs.doubts import check_units
-from bayessim_mjx.logs.duplicates import without_copies
 from bayessim_mjx.logs.files import FORMAT, Paths, distinct, files_of, map_of_folder, side_yaml
 from bayessim_mjx.logs.jitter import say_better_clock
 from bayessim_mjx.logs.jsonl import read_jsonl
@@ -84,6 +83,7 @@ def _read_one(
         columns, sources = _columns(table, channels, log_map)
     columns, absent = filled(table, columns, channels, mj_model) if partial else (columns, ())
     check_names(table, columns, channels)
+    table, columns = oldest_first(table, columns)
     if table.lenient:
         table, columns = leave_out(table, columns, sources, channels, log_map.bad_rows)
     table, columns = without_copies(table, columns)
@@ -110,7 +110,7 @@ def _read_one(
 
 
 def table_of(path: Path, log_map: LogMap) -> Table:
-    """The columns of a file as the map says it is written.
+    """Return the columns of a file as the map says it is written.
 
     Raises:
         UserError: a file that cannot be read so.
@@ -119,7 +119,7 @@ def table_of(path: Path, log_map: LogMap) -> Table:
     if path.suffix == ".npz":
         return replace(read_npz(path), lenient=form.lenient)
     if path.suffix == ".jsonl":
-        return read_jsonl(path, form.skip_rows, form.lenient, form.encoding)
+        return read_jsonl(path, form.skip_rows, form.lenient, form.encoding, form.decimal)
     return read_csv(path, form)
 
 
@@ -139,7 +139,7 @@ def _check_map(log_map: LogMap, channels: Channels) -> None:
 
 
 def _columns(table: Table, channels: Channels, log_map: LogMap) -> tuple[dict[str, Array], dict[str, str]]:
-    """The file's own columns as channels, and {channel: column} of what is needed.
+    """Return the file's own columns as channels, and {channel: column} of what is needed.
 
     Text columns that nobody asked for are left out with a warning.
     """

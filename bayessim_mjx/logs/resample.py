@@ -1,4 +1,4 @@
-"""Logs at the control period, and windows of them ready for replay in simulation."""
+"""Logs at the control period, with the mean of their commands, and windows of them ready for replay in simulation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.commands import means
 from bayessim_mjx.logs.log import TIMING, Array, Log
 
 
@@ -22,7 +21,7 @@ def is_even(log: Log, dt: float) -> bool:
 
 
 def resample(log: Log, dt: float, kind: Literal["cubic", "linear"] = "cubic") -> Log:
-    """The log on the grid time[0] + k dt. Command k is held over [t_k, t_k + dt).
+    """Return the log on the grid time[0] + k dt. Command k is held over [t_k, t_k + dt).
 
     Positions and velocities are interpolated. A logged command is held until the next row; the command of a step is
     the *mean* of that held signal over the step (its impulse is kept, no sample is skipped and no delay added).
@@ -72,7 +71,7 @@ def _mean(time: Array, x: Array, grid: Array, dt: float, linear: bool = False) -
 
 
 def _held(even: Log, dt: float) -> Log:
-    """An even log with the means of its commands in their place, where these are linear or late."""
+    """Put the means of the commands of an even log in their place, where these are linear or late."""
     if not even.linear and not even.late:
         return even
     ctrl = _mean(even.time + even.late, even.ctrl, even.time, dt, even.linear)
@@ -103,7 +102,7 @@ def _normalised(log: Log, qpos: Array) -> Array:
 
 
 def around(log: Log, start: int, rows: int) -> NDArray[np.int64]:
-    """Indices of the log's rows `start - rows .. start + rows`; beyond its ends the end is held."""
+    """Return indices of the log's rows `start - rows .. start + rows`; beyond its ends the end is held."""
     return np.clip(np.arange(start - rows, start + rows + 1), 0, len(log) - 1)
 
 
@@ -184,3 +183,47 @@ def noise(logs: Log | Sequence[Log]) -> dict[str, Array]:
         return np.sqrt(square.sum(0) / np.maximum((square > 0).sum(0), 1))
 
     return {"qpos": pooled([log.sigma_qpos for log in runs]), "qvel": pooled([log.sigma_qvel for log in runs])}
+
+
+def means(time: Array, x: Array, edges: Array, step: float, beyond: tuple[float, float], linear: bool = False) -> Array:
+    """Mean of x over each interval between two edges; x rests at its ends before its first and after its last row.
+
+    Args:
+        time: [T], s.
+        x: [T, n], x[k] from time[k] to time[k+1], or at time[k] where `linear`.
+        edges: [K + 1], s, one every `step` s.
+        beyond: s, more than what the edges need, by which the ends are held before and after.
+        linear: x runs linearly from row to row.
+
+    Returns:
+        [K, n].
+    """
+    return np.diff(integrals(time, x, edges, beyond, linear), axis=0) / step
+
+
+def integrals(time: Array, x: Array, edges: Array, beyond: tuple[float, float], linear: bool = False) -> Array:
+    """Integrals of x [K + 1, n] from the same beginning to each edge; arguments as of `means`."""
+    if not x.shape[1]:
+        return np.zeros((len(edges), 0))
+    before = min(edges[0], time[0]) - beyond[0]
+    after = max(edges[-1], time[-1]) + beyond[1]
+    return _ramps(time, x, edges, before) if linear else _steps(time, x, edges, before, after)
+
+
+def _steps(time: Array, x: Array, edges: Array, before: float, after: float) -> Array:
+    """Integrals of each column from `before` to the edges."""
+    times = np.concatenate([[before], time[1:], [after]])
+    area = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x * np.diff(times)[:, None], axis=0)])
+    return np.stack([np.interp(edges, times, a) for a in area.T], 1)
+
+
+def _ramps(time: Array, x: Array, edges: Array, before: float) -> Array:
+    """Integrate the trapezoids between rows: within a row the integral is a parabola."""
+    times, values = np.append(before, time), np.concatenate([x[:1], x])
+    steps = np.diff(times)
+    area = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(0.5 * (values[1:] + values[:-1]) * steps[:, None], 0)])
+    rise = np.append(np.where(steps > 0, 1 / np.maximum(steps, 1e-300), 0.0), 0.0)[:, None]
+    slope = rise * np.concatenate([np.diff(values, axis=0), np.zeros((1, x.shape[1]))])
+    at = np.clip(np.searchsorted(times, edges, side="right") - 1, 0, len(times) - 1)
+    since = (edges - times[at])[:, None]
+    return np.asarray(area[at] + values[at] * since + 0.5 * slope[at] * since**2)

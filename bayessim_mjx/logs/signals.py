@@ -37,7 +37,7 @@ def values_shown(x: Array) -> int:
 
 
 def noise_level(x: Array, grain: float | None = None) -> float:
-    """Standard deviation of the measurement noise in x [T]: max(quantum / sqrt 12, robust high-frequency residual).
+    """Return the standard deviation of the noise in x [T]: max(quantum / sqrt 12, robust high-frequency residual).
 
     `grain` is the quantum where it is known; otherwise it is estimated. The fourth difference of white noise has
     variance 70 sigma^2; its median is blind to rare jerks of the true motion.

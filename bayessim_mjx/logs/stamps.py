@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from datetime import datetime
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -18,14 +19,17 @@ PERIODS = (1e-4, 1.0)  # s between rows of a log of a robot; rule of thumb, not 
 WINDOW = 7  # rows through which a parabola is put; rule of thumb, not measured
 
 
-def seconds_of(raw: Array, table: Table, column: str) -> Array:
+def seconds_of(raw: Array, table: Table, column: str, suffix: str = "") -> Array:
     """Stamps [T] whose unit nobody stated, as seconds.
 
     Stamps since 1970 in ms, us or ns, days of a spreadsheet, and a unit at the end of the column's name are taken where
-    no other reading has a period of `PERIODS`. All other stamps are seconds.
+    no other reading has a period of `PERIODS`. All other stamps are seconds, with a warning where ms would fit too.
+
+    Args:
+        suffix: text behind each number.
 
     Raises:
-        UserError: two readings fit.
+        UserError: two readings fit, or digits of a date.
     """
     seen = raw[np.isfinite(raw)]
     if len(seen) < 2:
@@ -41,14 +45,48 @@ def seconds_of(raw: Array, table: Table, column: str) -> Array:
     if DAYS[0] <= start <= DAYS[1] and step < 1.2e-5 and _period(step * units.TIMES["days"]):
         _say(table, column, "days of a spreadsheet", "days")
         return (raw - start) * units.TIMES["days"]
-    unit = "s" if column == "time" else units.of_name(column) or "s"
+    if _written_out(start):
+        key = f"`time: {{column: {column!r}, format: '%Y%m%d%H%M%S.%f'}}`"
+        raise UserError(
+            f"{table.path}: column {column!r}: {start:.0f} reads as a date without marks; state {key} in a map"
+        )
+    named = units.of_name(f"[{suffix.strip()}]") or (None if column == "time" else units.of_name(column))
+    unit = named or "s"
     if unit not in units.TIMES:
         return raw
     if unit != "s":
         return _named(raw, step, table, column, unit)
-    if step == 1.0 and (steps == np.floor(steps)).all() and _whole(table, column) and (steps > 0).all():
+    if step == 1.0 and (seen == np.floor(seen)).all() and (steps > 0).all():
         raise UserError(f"{_doubt(table, column, 'ms')}: whole numbers that grow by 1")
+    if named is None and _period(step) and _period(step * units.TIMES["ms"]):
+        text = f"{table.path}: column {column!r} has a row every {step:.4g} s; if it is in ms, `time: {{column: "
+        warnings.warn(f"{text}{column!r}, unit: ms}}` in a map says so, and `unit: s` if not", stacklevel=6)
     return raw
+
+
+def _written_out(start: float) -> bool:
+    """Whether a number is a date from 2000 to 2099 written as year, month, day, hours, minutes and seconds."""
+    try:
+        return datetime.strptime(f"{start:.0f}", "%Y%m%d%H%M%S").year // 100 == 20
+    except ValueError:
+        return False
+
+
+def check_counter(raw: Array, table: Table, column: str) -> None:
+    """Whole stamps do not run over: a counter of 16 or 32 bits begins at 0 again.
+
+    Raises:
+        UserError: they do; names the key `wrap`.
+    """
+    steps = np.diff(raw[np.isfinite(raw)])
+    back = steps[steps < 0]
+    if not len(back) or not (raw[np.isfinite(raw)] % 1 == 0).all():
+        return
+    forward = float(steps.max())
+    for bits in (16, 32):
+        if ((back + 2**bits > 0) & (back + 2**bits <= 2.0 * forward)).all():
+            text = f"{table.path}: column {column!r} runs back by {-back[0]:.0f}, as a counter of {bits} bits does"
+            raise UserError(f"{text}; `time: {{column: {column!r}, wrap: {2**bits}}}` in a map lets it go on")
 
 
 def _period(step: float) -> bool:
@@ -66,7 +104,7 @@ def _doubt(table: Table, column: str, unit: str) -> str:
 
 
 def _named(raw: Array, step: float, table: Table, column: str, unit: str) -> Array:
-    """The column's name bears a unit other than the second."""
+    """Convert stamps of a column whose name bears a unit other than the second."""
     scale = units.TIMES[unit]
     if _period(step * scale) and not _period(step):
         _say(table, column, f"{unit}, as its name says", unit)
@@ -74,16 +112,8 @@ def _named(raw: Array, step: float, table: Table, column: str, unit: str) -> Arr
     raise UserError(f"{_doubt(table, column, unit)}: its name says {unit}, and its median step is {step:.4g}")
 
 
-def _whole(table: Table, column: str) -> bool:
-    """Whether all fields are written as whole numbers."""
-    values = table.columns[column]
-    if isinstance(values, np.ndarray) and values.dtype.kind not in "US":
-        return values.dtype.kind in "iu"
-    return all(str(v).strip().lstrip("+-").isdigit() for v in values if str(v).strip())
-
-
 def even(raw: Array, rate: float, table: Table, column: str) -> Array:
-    """Times [T] of rows that follow each other at `rate` [1/s], from stamps that are too coarse or come too late.
+    """Return times [T] of rows that go on at `rate` [1/s], from stamps that are too coarse or come too late.
 
     Raises:
         UserError: stamps with another rate, or with a gap.
@@ -147,4 +177,4 @@ def better_clock(time: Array, rate: float, positions: Array) -> tuple[str, float
     return ("rate", ratio) if ratio > 1 else ("stamps", 1.0 / ratio)
 
 
-__all__ = ["better_clock", "coarseness", "even", "roughness", "seconds_of"]
+__all__ = ["better_clock", "check_counter", "coarseness", "even", "roughness", "seconds_of"]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import instants
 from bayessim_mjx.logs.log import Array
-from bayessim_mjx.logs.numerals import Marks
+from bayessim_mjx.logs.texts import Marks
 
 _WORDS = {"true": 1.0, "yes": 1.0, "on": 1.0, "false": 0.0, "no": 0.0, "off": 0.0, "": float("nan")}
 _COMMAS = Marks(",")
@@ -40,7 +40,7 @@ class Table:
         return len(next(iter(self.columns.values())))
 
     def row(self, row: int) -> int:
-        """The row as the file counts it."""
+        """Return the row as the file counts it."""
         return row if self.kept is None else int(self.kept[row])
 
     def where(self, row: int) -> str:
@@ -80,7 +80,7 @@ class Table:
         return {row: f"column {column!r} holds {values[row]!r}" for row in rows}
 
     def numbers(self, column: str, suffix: str = "") -> Array:
-        """The column as float64 [T]; blank fields are NaN. A column of words alone: true, yes, on are 1, the others 0.
+        """Read the column as float64 [T]; blank fields are NaN. Of words alone true, yes and on are 1, the others 0.
 
         Args:
             suffix: text behind each number, such as its unit.

@@ -47,7 +47,7 @@ def placed(
     absent: tuple[str, ...] = (),
     declared: NDArray[np.bool_] | None = None,
 ) -> None:
-    """Moves readings and targets of hinges by whole turns in place, with a warning that says how to state it.
+    """Move readings and targets of hinges by whole turns in place, with a warning that says how to state it.
 
     Args:
         columns: channels [T]; positions are unwrapped already.
@@ -90,7 +90,7 @@ def _unwrapped_target(table: Table, name: str, target: Array, reading: Array) ->
 
 
 def _to_target(table: Table, columns: dict[str, Array], reading: str, target: str, on: Array | None) -> bool:
-    """Moves a reading to its target; whether they are near each other now."""
+    """Move a reading to its target; return whether they are near each other now."""
     used = np.ones(len(columns[reading]), bool) if on is None else np.nan_to_num(on, nan=1.0) > 0.5
     apart = (columns[reading] - columns[target])[used]
     if not len(apart):
@@ -113,7 +113,7 @@ def _to_target(table: Table, columns: dict[str, Array], reading: str, target: st
 
 
 def _into_range(table: Table, columns: dict[str, Array], name: str, low: float, high: float) -> None:
-    """Moves a reading that lies outside its joint's range throughout, where whole turns bring all of it inside."""
+    """Move a reading that lies outside its joint's range throughout, where whole turns bring all of it inside."""
     x, slack = columns[name], 0.02 * (high - low)
     if ((x >= low - slack) & (x <= high + slack)).mean() > 1.0 - MOST:
         return

@@ -11,9 +11,13 @@ ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0, "rev": TURN}
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TURNING = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rev/s": TURN, "rpm": TURN / 60.0}
 MOVING = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3}
-FORCES = {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2, "N": 1.0, "V": 1.0, "mV": 1e-3}
+# the pound-force and the kilogram-force are exact: NIST SP 811 (2008), appendix B
+FORCES = {
+    "N m": 1.0, "mN m": 1e-3, "N cm": 1e-2, "kgf cm": 0.0980665, "ozf in": 0.007061551833, "lbf in": 0.1129848290276,
+    "lbf ft": 1.3558179483314, "N": 1.0, "V": 1.0, "mV": 1e-3,
+}  # fmt: skip
 CURRENTS = {"A": 1.0, "mA": 1e-3}
-COUNTS, PERCENT = "counts", "percent"
+COUNTS, PERCENT, PLAIN = "counts", "percent", "number"
 SCALES = {**TIMES, **ANGLES, **LENGTHS, **TURNING, **MOVING, **FORCES, **CURRENTS}
 POSITIONS = (*ANGLES, *LENGTHS, COUNTS, PERCENT)
 OF_STREAM = {
@@ -32,21 +36,39 @@ _SPELT = {
     "rev": "rev", "turns": "rev", "mm": "mm", "cm": "cm", "%": PERCENT, "pct": PERCENT, "percent": PERCENT,
     "counts": COUNTS, "ticks": COUNTS, "steps": COUNTS, "raw": COUNTS,
     "rad/s": "rad/s", "deg/s": "deg/s", "°/s": "deg/s", "dps": "deg/s", "rpm": "rpm", "rev/s": "rev/s", "mm/s": "mm/s",
-    "ma": "mA", "mnm": "mN m", "ncm": "N cm", "mv": "mV",
+    "ma": "mA", "mnm": "mN m", "ncm": "N cm", "mv": "mV", "kgcm": "kgf cm", "kgfcm": "kgf cm", "ozin": "ozf in",
+    "inlb": "lbf in", "lbin": "lbf in", "ftlb": "lbf ft", "lbft": "lbf ft",
+}  # fmt: skip
+# only in brackets: as the last part of a name these are words of their own
+_IN_BRACKETS = {
+    "a": "A", "amp": "A", "amps": "A", "n": "N", "v": "V", "volt": "V", "volts": "V", "m": "m", "nm": "N m",
+    "n.m": "N m",
+    "radian": "rad", "radians": "rad", "m/s": "m/s", "min": "min", "rev": "rev", "turn": "rev", "count": COUNTS,
+    "-": PLAIN,
 }  # fmt: skip
 _END = re.compile(r"(?:[\[(<{]\s*([^\])>}]+?)\s*[\])>}]|(?:^|[_\s.:-])([A-Za-zµμ°%]+(?:/s)?))\s*$")
 
 
 def of_name(column: str) -> str | None:
-    """The unit at the end of a column's name (`angle [deg]`, `t_ms`), or None where it bears none that is known."""
+    """Return the known unit at the end of a column's name (`angle [deg]`, `t_ms`), or None."""
     match = _END.search(column.strip())
     if match is None:
         return None
-    return _SPELT.get((match[1] or match[2]).lower().replace(" ", ""))
+    if match[1] is None:
+        return _SPELT.get(match[2].lower())
+    text = re.sub(r"[\s*\u00b7\u22c5]|(?<=\w)[-_](?=\w)", "", match[1].lower())
+    return _SPELT.get(text) or _IN_BRACKETS.get(text)
+
+
+def foreign(column: str) -> str | None:
+    """Return text in brackets at the end of a name that is neither a known unit nor an index, or None."""
+    match = _END.search(column.strip())
+    known = match is None or match[1] is None or of_name(column) is not None
+    return None if known or match is None or re.fullmatch(r"[\d\s:,]+", match[1]) else match[0].strip()
 
 
 def scale_of(unit: str, resolution: float | None, torque_constant: float | None) -> float:
-    """The model's unit per unit of the file.
+    """Return the model's unit per unit of the file.
 
     Args:
         unit: other than percent.
@@ -57,4 +79,16 @@ def scale_of(unit: str, resolution: float | None, torque_constant: float | None)
     return SCALES[unit] * (1.0 if torque_constant is None or unit not in CURRENTS else torque_constant)
 
 
-__all__ = ["ANGLES", "COUNTS", "CURRENTS", "LENGTHS", "OF_STREAM", "PERCENT", "TIMES", "of_name", "scale_of"]
+__all__ = [
+    "ANGLES",
+    "COUNTS",
+    "CURRENTS",
+    "LENGTHS",
+    "OF_STREAM",
+    "PERCENT",
+    "PLAIN",
+    "TIMES",
+    "foreign",
+    "of_name",
+    "scale_of",
+]

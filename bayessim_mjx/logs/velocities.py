@@ -101,7 +101,7 @@ def agreeing(seen: Sequence[Velocity], step: float) -> dict[str, bool]:
 
 
 def trusted(logs: Sequence[Log], step: float) -> tuple[list[Log], list[str]]:
-    """The logs with their positions' derivatives in the place of velocities that do not agree; and a note on each.
+    """Return logs with their positions' derivatives in the place of velocities that do not agree; and a note on each.
 
     A filter takes each measurement as on time, with a noise of its own. A late velocity then passes for forces that
     nobody modelled, and a posterior leans by more than it says.

@@ -17,11 +17,7 @@ it, but for the UR10e: there it is the robot as identified without its load. Ope
 from __future__ import annotations
 
 import argparse
-import importlib
-import io
 import json
-import pickle
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +25,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import yaml
+
+from bayessim_mjx.logs.importers.pace import arrays
 
 CONDITIONS = 6  # blocks in time of the single recordings, held out in turn
 
@@ -51,39 +49,6 @@ class Logs:
     def done(self, model: str, published: dict[str, Any]) -> None:
         (self.out / "model.xml").write_text(model)
         (self.out / "published.json").write_text(json.dumps(published, indent=1))
-
-
-STORAGES = {"FloatStorage": np.float32, "DoubleStorage": np.float64, "LongStorage": np.int64}
-
-
-class _Arrays(pickle.Unpickler):
-    """Arrays and tensors that PyTorch saved, without PyTorch; nothing but numpy's own functions is called."""
-
-    def __init__(self, archive: zipfile.ZipFile, name: str) -> None:
-        super().__init__(io.BytesIO(archive.read(name)))
-        self.archive, self.folder = archive, name.rpartition("/")[0]
-
-    def find_class(self, module: str, name: str) -> Any:
-        if name == "_rebuild_tensor_v2":
-            return lambda data, start, shape, strides, *rest: np.lib.stride_tricks.as_strided(
-                data[start:], shape, [s * data.itemsize for s in strides]
-            )
-        if module == "torch" and name in STORAGES:
-            return STORAGES[name]
-        if (module, name) == ("collections", "OrderedDict"):
-            return dict
-        if module.startswith("numpy") or (module, name) == ("_codecs", "encode"):
-            return getattr(importlib.import_module(module), name)
-        raise ValueError(f"{module}.{name} in a file that should hold arrays only")
-
-    def persistent_load(self, pid: tuple) -> np.ndarray:
-        return np.frombuffer(self.archive.read(f"{self.folder}/data/{pid[2]}"), pid[1])
-
-
-def arrays(path: Path) -> dict[str, np.ndarray]:
-    with zipfile.ZipFile(path) as archive:
-        found = next(n for n in archive.namelist() if n.endswith("/data.pkl"))
-        return {k: np.asarray(v) for k, v in _Arrays(archive, found).load().items()}
 
 
 def bare(tree: ElementTree.Element, keep: Sequence[str]) -> None:

@@ -66,7 +66,7 @@ Cells = Callable[[int, int, float], str]
 
 
 def text(table: np.ndarray, header: str = HEADER, sep: str = ",", form: str | Cells = "%.6f", end: str = "\n") -> str:
-    """A table as text; `form` is a format, or what makes a field of (row, column, value)."""
+    """Write a table as text; `form` is a format, or what makes a field of (row, column, value)."""
     make: Cells = form if callable(form) else lambda i, j, x: form % x
     lines = [sep.join(make(i, j, x) for j, x in enumerate(row)) for i, row in enumerate(table)]
     return end.join([*([header] if header else []), *lines]) + end
@@ -77,7 +77,7 @@ def comma(i: int, j: int, x: float) -> str:
 
 
 def stamped(make: Callable[[int], str], table: np.ndarray = TRUTH, header: str = HEADER, sep: str = ",") -> str:
-    """The table with other texts in its first column."""
+    """Return the table with other texts in its first column."""
     return text(table, header, sep, lambda i, j, x: make(i) if j == 0 else f"{x:.6f}")
 
 

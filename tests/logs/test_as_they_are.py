@@ -183,3 +183,13 @@ def test_json_lines_hold_the_same_log(tmp_path: Path, arm: mujoco.MjModel) -> No
                         ('{"q": {"a": 1}, "q:a": 2}', ("line 1", "two values of 'q:a'"))):  # fmt: skip
         path.write_text(text)
         refused(tmp_path, arm, "run.jsonl", *words, map=log_map)
+
+
+def test_decimal_commas_in_texts_of_json_need_their_key(tmp_path: Path, arm: mujoco.MjModel) -> None:
+    names = {"m_shoulder": "u[0]", "m_elbow": "u[1]"}
+    log_map = {"time": "t", "ctrl": names, "qpos": {"shoulder": "q", "elbow": {"value": 0}}}
+    lines = [{"t": r[0], "u": [r[1], r[2]], "q": str(r[3]).replace(".", ",")} for r in rows().tolist()]
+    (tmp_path / "run.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    refused(tmp_path, arm, "run.jsonl", "`decimal`", map=log_map)
+    (log,) = read_logs(tmp_path, arm, {**log_map, "decimal": ","})
+    np.testing.assert_array_equal(np.c_[log.time, log.ctrl, log.qpos[:, 0]], rows()[:, :4])

@@ -125,3 +125,37 @@ def test_words_of_a_name_come_without_its_unit() -> None:
     assert parts("shoulderPos_deg") == ("shoulder", "pos")
     assert parts("angle A [\u00b0]") == ("angle", "a")
     assert parts("leg2HipPos") == ("leg", "2", "hip", "pos")
+
+
+def test_stamps_in_two_columns_and_names_in_columns_of_their_own_are_understood(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Of `rostopic echo -p`: a stamp of sec and nsec, and `field.name0` beside `field.position0`."""
+    names = "field.name0,field.name1,field.position0,field.position1"
+    head = f"header.stamp.secs,header.stamp.nsecs,{names},Soll shoulder,u_elbow"
+    lines = [
+        f"{1772619302 + i // 100},{i % 100 * 10**7},elbow,shoulder,{r[4]:.6f},{r[3]:.6f},{r[1]:.6f},{r[2]:.6f}"
+        for i, r in enumerate(rows())
+    ]
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    (folder / "run.csv").write_text("\n".join([head, *lines]))
+    code, out = check(capsys, folder, "--model", model_of(tmp_path))
+    assert code == 0, out
+    (log,) = read_logs(folder, MODEL)
+    np.testing.assert_allclose(np.c_[log.time - log.time[0], log.ctrl, log.qpos], rows(), atol=1e-6)
+    (folder / "map.yaml").unlink()
+    lines[7] = lines[7].replace("elbow,shoulder", "shoulder,elbow")  # another publisher
+    (folder / "run.csv").write_text("\n".join([head, *lines]))
+    code, out = check(capsys, folder, "--model", model_of(tmp_path))
+    assert code == 2 and "positions: qpos:shoulder, qpos:elbow" in out
+
+
+def test_commands_that_fit_the_other_joint_are_noted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    t = 0.01 * np.arange(200)
+    q = np.stack([0.5 * np.sin(3 * t), 0.3 * np.sin(5 * t + 1)], 1)
+    table = np.c_[t, q[:, ::-1], q]
+    _, out = check(capsys, logs_of(tmp_path, table, HEADER), "--model", model_of(tmp_path))
+    assert "the commands m_shoulder, m_elbow fit the motion far better as those of m_elbow, m_shoulder" in out, out
+    _, out = check(capsys, logs_of(tmp_path, np.c_[t, q, q], HEADER), "--model", model_of(tmp_path))
+    assert "far better" not in out

@@ -12,18 +12,19 @@ import pytest
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Log, LogMap, read_logs
 from tests.logs.dialects import SERVO, TRUTH, Case, text
+from tests.logs.dialects_of_habits import CASES as HABITS
 from tests.logs.dialects_of_texts import CASES as TEXTS
 from tests.logs.dialects_of_times import CASES as TIMES
 from tests.logs.dialects_of_units import CASES as UNITS
 from tests.logs.log_files import ARM, HEADER
 
-CASES = {case.name: case for case in (*TEXTS, *TIMES, *UNITS)}
+CASES = {case.name: case for case in (*TEXTS, *TIMES, *UNITS, *HABITS)}
 OWN = {"ctrl": ("m_shoulder", "m_elbow"), "qpos": ("shoulder", "elbow")}
 MODELS = {"arm": mujoco.MjModel.from_xml_string(ARM), "servo": mujoco.MjModel.from_xml_string(SERVO)}
 
 
 def read(path: Path, case: Case, log_map: Mapping[str, Any] | None) -> tuple[Log, str]:
-    """The one log of a case, and all that was said."""
+    """Return the one log of a case, and all that was said."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         (log,) = read_logs(path, MODELS[case.model], log_map)
@@ -39,7 +40,7 @@ def true(log: Log, case: Case) -> None:
 
 
 def test_there_are_many_and_each_has_a_name_and_a_source() -> None:
-    every = (*TEXTS, *TIMES, *UNITS)
+    every = (*TEXTS, *TIMES, *UNITS, *HABITS)
     assert len(every) == len(CASES) >= 60
     assert all(":" in case.complaint for case in every)
     assert all(case.words for case in every if case.refused)

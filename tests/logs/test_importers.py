@@ -44,7 +44,7 @@ def events() -> Iterator[tuple[str, int, Any]]:
 
 
 def as_sent(log: Log, dt: float = 0.005, rows: int = 80) -> None:
-    """The log of `events`: positions at their own times, commands held for two rows, the IMU interpolated."""
+    """Return the log of `events`: positions at their own times, commands held for two rows, the IMU interpolated."""
     t = dt * np.arange(rows)
     np.testing.assert_allclose(log.time, t, atol=1e-9)
     np.testing.assert_allclose(log.qpos, np.stack([angle(j, t) for j in JOINTS], 1), atol=1e-9)
@@ -91,7 +91,7 @@ def write_mcap(path: Path) -> None:
 
 
 def write_rosbag(path: Path) -> None:
-    """A bag of ROS 2 (a folder), or of ROS 1 (a file)."""
+    """Write a bag of ROS 2 (a folder), or of ROS 1 (a file)."""
     pytest.importorskip("rosbags", reason="the extra [logs] is not installed")
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
@@ -209,3 +209,46 @@ def test_arrays_of_an_hdf5_file_are_logs(tmp_path: Path, capsys: pytest.CaptureF
     assert "no array at 'observations/qvel'" in error(capsys, *start, "--rate", "200", "--out", tmp_path / "x")
     assert "neither --time nor --rate" in error(capsys, *start, "--out", tmp_path / "x")
     assert "has 1" in error(capsys, *start[:-1], *arrays, "--rate", "200", "--out", tmp_path / "x")
+
+
+LOW = {
+    "/lowstate": ("unitree_hg/msg/LowState", "uint32 tick\nIMUState imu_state\nMotorState[35] motor_state\n"),
+    "/lowcmd": ("unitree_hg/msg/LowCmd", "uint8 mode_pr\nMotorCmd[35] motor_cmd\n"),
+}
+MOTORS = (
+    f"{'=' * 80}\nMSG: unitree_hg/IMUState\nfloat32[3] gyroscope\nfloat32[3] accelerometer\n"
+    f"{'=' * 80}\nMSG: unitree_hg/MotorState\nuint8 mode\nfloat32 q\nfloat32 dq\nfloat32 tau_est\n"
+    f"{'=' * 80}\nMSG: unitree_hg/MotorCmd\nuint8 mode\nfloat32 q\nfloat32 dq\nfloat32 tau\nfloat32 kp\nfloat32 kd\n"
+)
+NAMES = {18: "shoulder", 25: "elbow"}  # numbers among 35 motors
+
+
+def test_an_mcap_file_of_unitrees_messages_is_read(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    writer_of = pytest.importorskip("mcap_ros2.writer", reason="the extra [logs] is not installed").Writer
+    with (tmp_path / "low.mcap").open("wb") as file:
+        writer = writer_of(file)
+        schemas = {topic: writer.register_msgdef(kind, text + MOTORS) for topic, (kind, text) in LOW.items()}
+        for k in range(80):
+            q = {i: float(angle(joint, 0.005 * k)) for i, joint in NAMES.items()}
+            imu = {"gyroscope": [0.5, 0.0, 0.0], "accelerometer": [0.0, 0.0, 9.5]}
+            seen = [{"mode": 1, "q": q.get(i, 0.0), "dq": 0.0, "tau_est": 0.0} for i in range(35)]
+            goal = [
+                {"mode": 1, "q": 0.5 * q.get(i, 0.0), "dq": 0.0, "tau": 0.0, "kp": 30.0, "kd": 1.0} for i in range(35)
+            ]
+            for topic, body in (
+                ("/lowstate", {"tick": k, "imu_state": imu, "motor_state": seen}),
+                ("/lowcmd", {"motor_cmd": goal}),
+            ):
+                writer.write_message(topic, schemas[topic], body, START + 5_000_000 * k, START + 5_000_000 * k)
+        writer.finish()
+    start = ("from-mcap", tmp_path / "low.mcap", "--model", model_of(tmp_path), "--out")
+    assert "`--joints`" in error(capsys, *start, tmp_path / "no")
+    joints = [NAMES.get(i, f"motor{i}") for i in range(26)]
+    out = call(capsys, *start, tmp_path / "logs", "--joints", *joints)
+    assert "low.yaml declares the position law of m_shoulder, m_elbow" in out
+    (log,) = read_logs(tmp_path / "logs", mujoco.MjModel.from_xml_string(ARM))
+    t = 0.005 * np.arange(80)
+    np.testing.assert_allclose(log.qpos, np.stack([angle(j, t) for j in JOINTS], 1), atol=1e-6)
+    np.testing.assert_allclose(log.ctrl, 0.5 * log.qpos, atol=1e-6)
+    assert set(log.streams["imu.accelerometer.z"]) == {9.5} and set(log.streams["imu.gyro.x"]) == {0.5}
+    assert log.metadata["controller"]["m_elbow"] == {"law": "position", "kp": 30.0, "kd": 1.0}

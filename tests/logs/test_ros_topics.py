@@ -140,3 +140,44 @@ def test_topics_that_cannot_be_read_are_named_with_their_types() -> None:
         recording("run", [strange, *(state(k) for k in range(20))], Choice())
     found = recording("run", [strange, *interleaved(state)], Choice())
     assert any("/low_state (unitree_go/msg/LowState)" in note for note in found.notes)
+
+
+def header(k: int) -> Any:
+    return stamp(START + STEP * k)
+
+
+def test_dynamic_joint_states_are_states_with_further_interfaces() -> None:
+    def state(k: int) -> Message:
+        values = [named(interface_names=["position", "current"], values=[0.01 * k, 2.0]),
+                  named(interface_names=["effort"], values=[1.0])]  # fmt: skip
+        body = named(header=header(k), joint_names=["elbow", "gripper"], interface_values=values)
+        return Message("/dynamic_joint_states", "DynamicJointState", START + STEP * k, body)
+
+    sent = [Message("/u", "Float64", START + STEP * k, named(data=float(k))) for k in range(50)]
+    found = recording("run", [*map(state, range(50)), *sent], Choice())
+    np.testing.assert_allclose(found.positions["elbow"].values, 0.01 * np.arange(50))
+    assert list(found.positions) == ["elbow"] and set(found.others["current:elbow"].values) == {2.0}
+    assert set(found.efforts["gripper"].values) == {1.0} and found.commands["elbow"].values[7] == 7.0
+
+
+def test_joints_of_several_numbers_are_positions_of_a_free_joint() -> None:
+    def pose(k: int) -> Message:
+        half, sign = 0.005 * k, -1 if k % 2 else 1
+        move = named(translation=named(x=0.1 * k, y=0.0, z=1.0),
+                     rotation=named(w=sign * np.cos(half), x=0.0, y=0.0, z=sign * np.sin(half)))  # fmt: skip
+        body = named(header=header(k), joint_names=["root"], transforms=[move], twist=[], wrench=[])
+        return Message("/multi", "MultiDOFJointState", START + STEP * k, body)
+
+    wheel = [
+        Message("/joint_states", "JointState", START + STEP * k,
+                named(header=header(k), name=["wheel"], position=[float(k)], velocity=[], effort=[]))
+        for k in range(50)
+    ]  # fmt: skip
+    sent = [Message("/u", "Float64MultiArray", START + STEP * k, named(data=[1.0])) for k in range(50)]
+    choice = Choice(commands={"/u": ("wheel",)})
+    for states in (wheel, []):
+        found = recording("run", [*map(pose, range(50)), *states, *sent], choice)
+        columns, _ = found.columns()
+        np.testing.assert_allclose(columns["position:root[0]"], 0.1 * np.arange(50))
+        np.testing.assert_allclose(columns["position:root[3]"], np.cos(0.005 * np.arange(50)))
+        assert ("position:wheel" in columns) == bool(states)

@@ -18,7 +18,7 @@ def logs():
 
 
 def late(log, rows, column=1):
-    """The elbow's velocity `rows` rows late."""
+    """Return the elbow's velocity `rows` rows late."""
     qvel = log.qvel.copy()
     qvel[rows:, column] = log.qvel[:-rows, column]
     return replace(log, qvel=qvel)

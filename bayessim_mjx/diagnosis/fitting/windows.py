@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.logcheck.noise import noise_of
 from bayessim_mjx.effects.support.motion import AROUND, Motion
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.commands import means
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import around as rows_around
-from bayessim_mjx.logs.resample import resample
+from bayessim_mjx.logs.resample import means, resample
 from bayessim_mjx.physics import controllers, staggered
 
 Array = NDArray[np.float64]

@@ -1,1 +1,1 @@
-"""Recordings of other tools as a folder of CSV files and the map that reads them: MCAP, ROS bags, LeRobot, HDF5."""
+"""Recordings of other tools as CSV files and the map that reads them: MCAP, ROS bags, LeRobot, HDF5, PACE."""

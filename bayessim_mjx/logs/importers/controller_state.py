@@ -21,13 +21,13 @@ WANTED, SEEN, SENT = ("reference", "desired"), ("feedback", "actual"), ("output"
 
 
 def _point(body: Any, names: Sequence[str]) -> Any:
-    """The first of the points that holds anything, or None."""
+    """Return the first of the points that holds anything, or None."""
     found = [getattr(body, name) for name in names if getattr(body, name, None) is not None]
     return next((p for p in found if any(len(getattr(p, f)) for f in POINT.values())), None)
 
 
 def state_of(message: Message) -> Message:
-    """The message as one of `JointState`: of a controller, what it measured."""
+    """Return the message as one of `JointState`: of a controller, what it measured."""
     if message.kind != CONTROLLER:
         return message
     point = _point(message.body, SEEN)
@@ -84,7 +84,7 @@ def _of_points(messages: Sequence[Message], names: Sequence[str], field: str, cl
 
 
 def field_used(messages: Sequence[Message], choice: Choice) -> str:
-    """What of a controller's messages are the commands, in words; "" for other messages."""
+    """Name the part of a controller's messages that holds the commands; "" for other messages."""
     if messages[0].kind != CONTROLLER:
         return ""
     points, field = _used(messages, choice)

@@ -15,6 +15,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.importers.streams import Recording
 from bayessim_mjx.logs.log import Array, Channels, suggest
 from bayessim_mjx.logs.units import TURN
+from bayessim_mjx.logs.vendors import is_servo
 
 HEAD = """# How the columns of the files beside it become channels of the model (docs/logs.md).
 # Measured signals were interpolated linearly onto the times of the positions, commands averaged over each row.
@@ -58,6 +59,11 @@ class Target:
             self.notes += [note for note in recording.notes if note not in self.notes]
             self._doubt(recording.name, columns)
             written.append(_csv(self.folder / f"{recording.name}.csv", columns))
+            laws = {d: law for j, law in recording.laws.items() if (d := self._actuator(f"law:{j}")) and self._open(d)}
+            if laws:
+                side = written[-1].with_suffix(".yaml")
+                side.write_text(yaml.safe_dump({"controller": laws}, sort_keys=False, width=110))
+                self.notes.append(f"{recording.name}: {side.name} declares the position law of {', '.join(laws)}")
         if not written:
             raise UserError("nothing was recorded; allowed: files with at least one run")
         (self.folder / "map.yaml").write_text(HEAD + yaml.safe_dump(self._map(list(every)), sort_keys=False, width=110))
@@ -73,7 +79,9 @@ class Target:
         blocks = {
             p: [c for c in columns if c.startswith(f"{p}:")] for p in ("position", "velocity", "effort", "command")
         }
-        others = [c for c in columns if c != "time" and not any(c in block for block in blocks.values())]
+        others = {c: c for c in columns if c != "time" and not any(c in block for block in blocks.values())}
+        switches = [c for c in others if c.startswith("enabled:")]
+        others |= {f"enabled:{drive}": others.pop(c) for c in switches if (drive := self._actuator(c))}
         joints = {self._joint(c): c for c in blocks["position"]}
         speeds = {self._joint(c): c for c in blocks["velocity"]}
         drives = {self._actuator(c): c for c in blocks["command"]}
@@ -89,7 +97,7 @@ class Target:
             "qvel": {joint: self._scaled(speeds[joint]) for joint in joints}
             if whole and len(qpos) == len(joints)
             else {},
-            "streams": efforts | {c: c for c in others},
+            "streams": efforts | others,
         }
 
     def _scaled(self, column: str) -> Any:
@@ -101,12 +109,12 @@ class Target:
         return self.rename.get(name, name)
 
     def _joint(self, column: str) -> str:
-        """The joint's name in the model, "" if it has none."""
+        """Return the joint's name in the model, "" if it has none."""
         name = self._name(column)
         return name if self.model is None or name in Channels.of(self.model).qpos else ""
 
     def _actuator(self, column: str) -> str:
-        """The actuator of this name, or the only one on the joint of this name; "" if there is none."""
+        """Return the actuator of this name, or the only one on the joint of this name; "" if there is none."""
         name = self._name(column)
         if self.model is None:
             return name
@@ -119,6 +127,10 @@ class Target:
             names = ", ".join(channels.actuators[i] for i in own)
             raise UserError(f"joint {name!r} has actuators {names}; allowed: --rename {name}=ACTUATOR")
         return channels.actuators[own[0]] if len(own) else ""
+
+    def _open(self, drive: str) -> bool:
+        """Whether the model's actuator has no loop of its own, so that a logged law closes one."""
+        return self.model is None or not is_servo(self.model, Channels.of(self.model).actuators.index(drive))
 
     def _completed(self, joints: Mapping[str, str], drives: Mapping[str, str]) -> tuple[dict[str, Any], dict[str, Any]]:
         """(qpos, ctrl) of the map; what the model has and the recording lacks is held at its start, or 0."""

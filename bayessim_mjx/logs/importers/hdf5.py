@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.importers.arrays import numbered, recording
 from bayessim_mjx.logs.importers.needs import needs
-from bayessim_mjx.logs.importers.streams import Recording
+from bayessim_mjx.logs.importers.streams import Recording, numbered, recording
 
 WHAT = ("positions", "commands", "velocities", "efforts", "time")
 USUAL = {  # of ALOHA's files
@@ -41,7 +40,7 @@ class Paths:
 
 
 def recordings(path: Path, paths: Paths) -> Iterator[Recording]:
-    """The recordings of one file.
+    """Return the recordings of one file.
 
     Raises:
         UserError: no HDF5 file, no array at a path, neither times nor a rate.
@@ -61,7 +60,7 @@ def recordings(path: Path, paths: Paths) -> Iterator[Recording]:
 
 
 def _runs(path: Path, every: Sequence[str], pattern: str) -> list[str]:
-    """What stands for the `*` of the pattern, by its numbers; "" where it has none."""
+    """List the groups that the `*` of the pattern stands for, by their numbers; "" where it has none."""
     pattern = pattern.strip("/")
     if "*" not in pattern:
         return [""]

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.importers.arrays import numbered, recording
 from bayessim_mjx.logs.importers.needs import needs
-from bayessim_mjx.logs.importers.streams import Recording
+from bayessim_mjx.logs.importers.streams import Recording, numbered, recording
 from bayessim_mjx.logs.log import Array
 
 STATE, ACTION = "observation.state", "action"
@@ -54,7 +53,7 @@ def _info(folder: Path) -> Mapping[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Array]:
-    """The columns that are needed; lists become [T, n]."""
+    """Return the columns that are needed; lists become [T, n]."""
     parquet = needs("pyarrow.parquet", "from-lerobot", "pyarrow")
     schema = parquet.read_schema(path).names
     missing = [name for name in (STATE, ACTION, "episode_index") if name not in schema]
@@ -77,14 +76,14 @@ def _episode(name: str, columns: Mapping[str, Array], info: Mapping[str, Any]) -
 
 
 def _time(columns: Mapping[str, Array], fps: float) -> Array:
-    """The time stamps; where they are the frames' numbers at the rate, without the rounding of their float32."""
+    """Return the time stamps; where they are the frames' numbers at the rate, without the rounding of their float32."""
     frames = columns.get("frame_index", np.arange(len(columns["episode_index"]))) / fps
     stamps = columns.get("timestamp", frames)
     return frames if np.max(np.abs(stamps - stamps[0] - frames + frames[0])) < 1e-3 / fps + 1e-4 else stamps
 
 
 def _split(key: str, values: Array, info: Mapping[str, Any]) -> dict[str, tuple[list[str], Array]]:
-    """{what: (joints, [T, n])}: `elbow.pos` is a position of the joint elbow, a plain name too."""
+    """Return {what: (joints, [T, n])}: `elbow.pos` is a position of the joint elbow, a plain name too."""
     table = values.reshape(len(values), -1)
     given = numbered(_names(info["features"].get(key, {}).get("names")), table.shape[1])
     out: dict[str, tuple[list[str], list[Array]]] = {}

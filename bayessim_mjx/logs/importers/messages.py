@@ -11,8 +11,10 @@ import numpy as np
 from bayessim_mjx.logs.importers.streams import Stream
 
 STATE, IMU, CONTROLLER = "JointState", "Imu", "JointTrajectoryControllerState"
-COMMANDS = ("Float64MultiArray", "Float64", "JointTrajectory")
-KINDS = (STATE, IMU, CONTROLLER, *COMMANDS)
+DYNAMIC, MULTI, LOW_STATE, LOW_COMMAND = "DynamicJointState", "MultiDOFJointState", "LowState", "LowCmd"
+COMMANDS = ("Float64MultiArray", "Float64", "JointTrajectory", LOW_COMMAND)
+STATES = (STATE, DYNAMIC, LOW_STATE, CONTROLLER)  # of several kinds the first is read
+KINDS = (*STATES, MULTI, IMU, *COMMANDS)
 FIELDS = ("position", "velocity", "effort")
 FAR = 1_000_000_000  # ns between stamp and receipt: two clocks; rule of thumb, not measured
 Kind = Literal["measured", "held", "linear"]
@@ -52,6 +54,7 @@ class Choice:
         stamps: header, or received: when a message was recorded.
         publisher: which of several publishers of the joint states, from 1.
         targets: the model's actuators are position servos, so the targets of a controller are their commands.
+        joints: names of motors that are numbered, in their order; hinges: the model's joints, which name them too.
     """
 
     states: str | None = None
@@ -60,6 +63,8 @@ class Choice:
     stamps: str = "header"
     publisher: int | None = None
     targets: bool = False
+    joints: Sequence[str] = ()
+    hinges: Sequence[str] = ()
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from bayessim_mjx.errors import UserError
 
 
 def needs(module: str, command: str, package: str) -> Any:
-    """The module.
+    """Import a module of an optional package.
 
     Raises:
         UserError: its package is not installed.

@@ -8,16 +8,24 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.importers.messages import FIELDS, Message
+from bayessim_mjx.logs.importers.streams import Stream
 from bayessim_mjx.logs.log import Array
-from bayessim_mjx.logs.signals import quantum
+from bayessim_mjx.logs.signals import derivative, noise_level, quantum
+from bayessim_mjx.logs.stamps import WINDOW
+from bayessim_mjx.quantities import percent
 
 # Rules of thumb, not measured.
 LEAST = 5e-3  # rad or m, apart from which two values are two
 COUNTS = 20.0  # steps of an encoder, within which a value may flicker; rule of thumb
 STEPS = 8.0  # usual steps from sample to sample, beyond which a value is off a smooth motion; rule of thumb
+# An order is far better if it leaves less than this share of the variance that the given one leaves, where that is more
+# than this share of all. Counted over simulated chains: of 160 right orders none is doubted, of 106 wrong ones whose
+# joints are driven in different ways 88 are found, 87 with the right order
+FAR = 0.5
 FEW = 5  # values off the motion from which another publisher is behind them; rule of thumb
 
 
@@ -46,7 +54,7 @@ class _Form:
 def of_one_publisher(
     name: str, topic: str, messages: Sequence[Message], chosen: int | None, received: bool = False
 ) -> list[Message]:
-    """The messages of joint states of one publisher, or of several that agree or have no joint in common.
+    """Return the messages of joint states of one publisher, or of several that agree or have no joint in common.
 
     Args:
         name: of the recording; topic: of the messages.
@@ -102,7 +110,7 @@ def _track(messages: Iterable[Message], joint: str) -> tuple[Array, Array]:
 
 
 def _apart(ranked: Sequence[tuple[_Form, Sequence[Message]]]) -> str:
-    """Publishers of other forms whose positions lie off those of the first, interleaved with it."""
+    """Find publishers of other forms whose positions lie off those of the first, interleaved with it."""
     for i, (first, many) in enumerate(ranked):
         for second, few in ranked[i + 1 :]:
             for joint in sorted(set(first.names) & set(second.names)):
@@ -149,8 +157,56 @@ def _two_tracks(messages: Sequence[Message]) -> str:
     return ""
 
 
+def better_order(
+    sent: Mapping[str, Stream], measured: Mapping[str, Mapping[str, Stream]]
+) -> tuple[list[str], list[str], str] | None:
+    """Return (joints as given, in the order that fits the motion far better, the shares explained), or None.
+
+    Each command is explained by a linear combination of one joint's position, its sine and cosine, velocity and its
+    sign, acceleration and effort; of all orders the one that explains most is compared with the given one (Kuhn 1955,
+    linear assignment).
+
+    Args:
+        sent: commands by joint, as the given order has them. measured: position, velocity, effort by joint.
+    """
+    joints = [j for j in sent if j in measured["position"]]
+    clock = measured["position"][joints[0]].sorted().time if len(joints) > 1 else np.zeros(0)
+    if len(joints) < 2 or len(clock) < WINDOW * len(joints):
+        return None
+    features = [_features(measured, joint, clock) for joint in joints]
+    left = np.array([[_unexplained(sent[command].on(clock), f) for f in features] for command in joints])
+    rows, best = linear_sum_assignment(np.log(np.maximum(left, np.finfo(np.float32).eps)))
+    moved = rows != best
+    given, other = (float(left[rows, k][moved].mean()) if moved.any() else 0.0 for k in (rows, best))
+    if given < FAR or other > FAR * given:
+        return None
+    return joints, [joints[j] for j in best], f"explains {percent(1.0 - other)} in place of {percent(1.0 - given)}"
+
+
+def _features(measured: Mapping[str, Mapping[str, Stream]], joint: str, clock: Array) -> Array:
+    """Return [T, n] of what one joint shows at the times [T], as far as it was sampled there."""
+    q = measured["position"][joint].on(clock)
+    seen = np.isfinite(q)
+    if seen.sum() < len(seen):
+        q = np.interp(clock, clock[seen], q[seen])
+    speed, _ = derivative(clock, q, noise_level(q))
+    change, _ = derivative(clock, speed, noise_level(speed))
+    effort = [measured["effort"][joint].on(clock)] if joint in measured["effort"] else []
+    return np.stack([np.ones_like(q), q, np.sin(q), np.cos(q), speed, np.sign(speed), change, *effort], 1)
+
+
+def _unexplained(x: Array, features: Array) -> float:
+    """Share of the variance of x [T] that no combination of the features [T, n] explains."""
+    known = np.isfinite(x) & np.isfinite(features).all(axis=1)
+    x, features = x[known], features[known]
+    if len(x) <= features.shape[1] or np.ptp(x) == 0:
+        return 1.0
+    residual = x - features @ np.linalg.lstsq(features, x, rcond=None)[0]
+    return float(np.var(residual) / np.var(x))
+
+
 def several_senders(name: str, topics: Iterable[str], by_topic: Mapping[str, Sequence[Any]]) -> list[str]:
-    """Notes on topics of commands that several nodes sent to: a drive acts on all of them."""
+    """Note topics of commands that several nodes sent to: a drive acts on all of them."""
     out = []
     for topic in topics:
         senders = sorted({m.publisher for m in by_topic[topic]})
@@ -160,4 +216,4 @@ def several_senders(name: str, topics: Iterable[str], by_topic: Mapping[str, Seq
     return out
 
 
-__all__ = ["of_one_publisher", "several_senders"]
+__all__ = ["of_one_publisher", "better_order", "several_senders"]

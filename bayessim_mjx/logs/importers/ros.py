@@ -10,26 +10,32 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.importers import adapted
 from bayessim_mjx.logs.importers.controller_state import field_used, of_controller, state_of, targets
 from bayessim_mjx.logs.importers.messages import (
     COMMANDS,
     CONTROLLER,
+    DYNAMIC,
     FIELDS,
     IMU,
     KINDS,
+    LOW_COMMAND,
+    LOW_STATE,
+    MULTI,
     STATE,
+    STATES,
     Choice,
     Clock,
     Kind,
     Message,
     streams,
 )
-from bayessim_mjx.logs.importers.publishers import of_one_publisher, several_senders
+from bayessim_mjx.logs.importers.publishers import better_order, of_one_publisher, several_senders
 from bayessim_mjx.logs.importers.streams import Recording, Stream
 
 
 def recording(name: str, messages: Iterable[Message], choice: Choice) -> Recording:
-    """The recording of one bag.
+    """Return the recording of one bag.
 
     Raises:
         UserError: topics that are missing or that cannot be told apart, arrays whose order is not known.
@@ -43,27 +49,75 @@ def recording(name: str, messages: Iterable[Message], choice: Choice) -> Recordi
     by_topic = topics.of
     commands = _command_topics(name, topics, choice)
     states = _state_topic(name, topics, choice, commands)
-    imus = [t for t, found in by_topic.items() if found[0].kind == IMU]
-    stamped = [m for t in dict.fromkeys((states, *commands, *imus)) for m in by_topic[t]]
-    clock = Clock.of(stamped, choice.stamps)
-    messages = of_one_publisher(name, states, [state_of(m) for m in by_topic[states]], choice.publisher, clock.received)
+    imus, bodies = topics.of_kind(IMU), topics.of_kind(MULTI)
+    read = dict.fromkeys((*([states] if states else []), *commands, *imus, *bodies))
+    clock = Clock.of([m for t in read for m in by_topic[t]], choice.stamps)
+    messages = _states(name, by_topic[states], choice) if states else []
+    messages = of_one_publisher(name, states, messages, choice.publisher, clock.received)
     measured = {f: _joints(messages, f, clock) for f in FIELDS}
-    sent: dict[str, Stream] = {}
-    for topic, names in commands.items():
-        streams = _commands(name, topic, by_topic[topic], names or (), list(measured["position"]), choice, clock)
-        if twice := sorted(set(streams) & set(sent)):
-            raise UserError(f"{name}: {topic} and another topic command {twice[0]!r}; choose by --commands TOPIC")
-        sent |= streams
-    others = {
-        k: s for t in commands if by_topic[t][0].kind == CONTROLLER for k, s in targets(by_topic[t], clock).items()
-    }
+    for topic in bodies:
+        measured["position"] |= adapted.multi(by_topic[topic], clock)
+    sent, others, laws, notes = _sent(name, commands, by_topic, measured, choice, clock)
+    if states and by_topic[states][0].kind == DYNAMIC:
+        others |= adapted.other_interfaces(by_topic[states], clock)
+    if states and by_topic[states][0].kind == LOW_STATE:
+        others |= adapted.low_imu(by_topic[states], clock)
     others |= {k: s for t in imus for k, s in _imu(t, by_topic[t], clock, len(imus) > 1).items()}
-    notes = [f"{name}: states {states}; commands {', '.join(commands)}", *clock.notes]
-    notes += [f"{name}: {t}: {used}" for t in commands if (used := field_used(by_topic[t], choice))]
-    notes += several_senders(name, commands, by_topic)
+    said = [
+        f"{name}: states {', '.join(filter(None, (states, *bodies)))}; commands {', '.join(commands)}",
+        *clock.notes,
+    ]
+    notes = [*said, *notes, *several_senders(name, commands, by_topic)]
     if topics.unread:
         notes.append(f"{name}: not read, as their types are not known here: {topics.left()}")
-    return Recording(name, measured["position"], sent, measured["velocity"], measured["effort"], others, notes)
+    return Recording(name, measured["position"], sent, measured["velocity"], measured["effort"], others, notes, laws)
+
+
+def _states(name: str, messages: Sequence[Message], choice: Choice) -> list[Message]:
+    """Return the messages as ones of `JointState`."""
+    kind = messages[0].kind
+    if kind == LOW_STATE:
+        motors = adapted.motors_of(name, messages, choice)
+        return [adapted.low_state(m, motors) for m in messages]
+    return [adapted.dynamic(m) if kind == DYNAMIC else state_of(m) for m in messages]
+
+
+def _sent(
+    name: str,
+    topics: Mapping[str, Sequence[str]],
+    by_topic: Mapping[str, Sequence[Message]],
+    measured: Mapping[str, dict[str, Stream]],
+    choice: Choice,
+    clock: Clock,
+) -> tuple[dict[str, Stream], dict[str, Stream], dict[str, Any], list[str]]:
+    """(commands, further columns, laws of the drives, notes) of all topics of commands."""
+    sent: dict[str, Stream] = {}
+    others: dict[str, Stream] = {}
+    laws: dict[str, Any] = {}
+    notes: list[str] = []
+    for topic, names in topics.items():
+        found = by_topic[topic]
+        if found[0].kind == LOW_COMMAND:
+            motors = adapted.motors_of(name, found, choice)
+            new, law, said = adapted.low_commands(topic, found, motors, measured, choice, clock)
+            laws |= law
+            notes += [f"{name}: {text}" for text in said]
+            others |= dict(adapted.enabled(found, motors, clock))
+        else:
+            new = _commands(name, topic, found, names or (), list(measured["position"]), choice, clock)
+            notes += [f"{name}: {topic}: {used}" for used in [field_used(found, choice)] if used]
+        if twice := sorted(set(new) & set(sent)):
+            raise UserError(f"{name}: {topic} and another topic command {twice[0]!r}; choose by --commands TOPIC")
+        if found[0].kind == CONTROLLER:
+            others |= targets(found, clock)
+        if hasattr(found[0].body, "data"):
+            found_order = better_order(new, measured)
+            if found_order is not None:
+                given, better, why = (",".join(x) if isinstance(x, list) else x for x in found_order)
+                text = f"{name}: {topic}: the motion fits the order {better} far better than {given} ({why})"
+                notes.append(f"{text}: --commands {topic}={better}, if that is the controller's order")
+        sent |= new
+    return sent, others, laws, notes
 
 
 @dataclass
@@ -98,12 +152,14 @@ def _command_topics(name: str, topics: _Topics, choice: Choice) -> Mapping[str, 
 
 
 def _state_topic(name: str, topics: _Topics, choice: Choice, commands: Iterable[str]) -> str:
-    found = [t for t in topics.of_kind(STATE) if t not in commands]
+    by_kind = [[t for t in topics.of_kind(kind) if kind != STATE or t not in commands] for kind in STATES]
     if choice.states is not None:
-        if choice.states not in [*found, *topics.of_kind(CONTROLLER)]:
-            raise UserError(f"{name}: --states {choice.states}: no topic of JointState; {topics.sentence()}")
+        if choice.states not in sum(by_kind, []):
+            raise UserError(f"{name}: --states {choice.states}: no topic of joint states; {topics.sentence()}")
         return choice.states
-    found = found or topics.of_kind(CONTROLLER)
+    found = next((each for each in by_kind if each), [])
+    if not found and topics.of_kind(MULTI):
+        return ""
     named = [t for t in found if t.rpartition("/")[2] == "joint_states"]
     best = found if len(found) == 1 else named
     if len(best) != 1:
@@ -156,12 +212,14 @@ def _order(name: str, topic: str, message: Message, count: int, joints: Sequence
         return labels
     if count == len(joints) == 1:
         return joints
-    allowed = f"allowed: --commands {topic}={','.join(joints[:count]) or 'JOINT'} with the joints in their order"
-    raise UserError(f"{name}: {topic} does not say which of its {count} values is whose; {allowed}")
+    letters = ",".join("ABCDEFGHIJKLMNOPQRSTUVWXYZ"[:count])
+    allowed = f"allowed: --commands {topic}={letters} with the joints ({', '.join(sorted(joints))} are measured) in the"
+    text = f"{name}: {topic} does not say which of its {count} values is whose; {allowed} order of the controller"
+    raise UserError(f"{text} (its parameter `joints`)")
 
 
 def _field(name: str, topic: str, bodies: Sequence[Any], fields: Sequence[str], choice: Choice) -> str:
-    """The field that holds the commands."""
+    """Return the field that holds the commands."""
     filled = [f for f in fields if any(len(getattr(b, f)) for b in bodies)]
     wanted = [f for f in filled if choice.field is not None and f.startswith(choice.field)]
     if len(wanted or filled) != 1 or (choice.field is not None and not wanted):

@@ -50,7 +50,8 @@ def of_rosbag(path: Path) -> Iterator[Message]:
     store = typesys.get_typestore(typesys.Stores.LATEST)  # for bags of ROS 2 that do not hold their types
     try:
         with highlevel.AnyReader([path], default_typestore=store) as reader:
-            wanted = [c for c in reader.connections if _short(c.msgtype) in KINDS]
+            known = reader.typestore.fielddefs  # of a bag that does not hold its types, the usual ones
+            wanted = [c for c in reader.connections if _short(c.msgtype) in KINDS and c.msgtype in known]
             for c in reader.connections:
                 if c not in wanted:
                     yield Message(c.topic, c.msgtype, 0, None)

@@ -1,17 +1,17 @@
-"""Signals with time stamps of their own, brought onto one clock."""
+"""Signals with time stamps of their own, or arrays of one sampling, brought onto one clock."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.commands import integrals
 from bayessim_mjx.logs.log import Array
 from bayessim_mjx.logs.pieces import MAX_GAP
+from bayessim_mjx.logs.resample import integrals
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Recording:
     Attributes:
         name: of the file that is written, without its ending.
         positions, velocities, efforts: by joint. commands: by joint or actuator. others: by column.
-        notes: what the user should know.
+        notes: what the user should know. laws: of the controllers in the drives, by joint (`metadata.controller`).
     """
 
     name: str
@@ -71,6 +71,7 @@ class Recording:
     efforts: Mapping[str, Stream] = field(default_factory=dict)
     others: Mapping[str, Stream] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    laws: Mapping[str, Any] = field(default_factory=dict)
 
     def columns(self) -> tuple[dict[str, Array], int]:
         """All signals on one clock, that of the first joint's positions: ({column: [T]}, rows that were left out).
@@ -101,3 +102,39 @@ class Recording:
         """From when to when each signal was recorded."""
         spans = {**self.positions, **{f"command {name}": stream for name, stream in self.commands.items()}}
         return ", ".join(f"{name} {s.time.min():.3f} to {s.time.max():.3f} s" for name, s in spans.items())
+
+
+def recording(
+    name: str,
+    time: Array,
+    arrays: Mapping[str, Array],
+    names: Mapping[str, Sequence[str]],
+    notes: Sequence[str] = (),
+    laws: Mapping[str, Any] | None = None,
+) -> Recording:
+    """Join arrays `positions`, `commands` [T, n] and, where there are some, `velocities` and `efforts`.
+
+    Args:
+        name: of the run.
+        time: [T], s.
+        arrays: by what they are.
+        names: of the columns of each.
+        notes: what the user should know. laws: of the drives, by joint.
+
+    Raises:
+        UserError: another number of rows or columns than times or names.
+    """
+    streams: dict[str, dict[str, Stream]] = {}
+    for what, values in arrays.items():
+        table = np.asarray(values, float).reshape(len(values), -1)
+        if table.shape != (len(time), len(names[what])):
+            allowed = f"allowed: {len(time)} rows, as many as times, of {', '.join(names[what])}"
+            raise UserError(f"{name}: {what} of shape {np.shape(values)}; {allowed}")
+        kind = "held" if what == "commands" else "measured"
+        streams[what] = {j: Stream(time, c, kind) for j, c in zip(names[what], table.T, strict=True)}  # type: ignore[arg-type]
+    return Recording(name, **streams, notes=notes, laws=laws or {})  # type: ignore[arg-type]
+
+
+def numbered(given: Sequence[str] | None, count: int) -> list[str]:
+    """Names of `count` columns: those given where they are as many, else `joint0`, `joint1` ..."""
+    return list(given) if given is not None and len(given) == count else [f"joint{i}" for i in range(count)]
