@@ -169,7 +169,7 @@ def _diagnose(argv: Sequence[str] | None) -> int:
     from bayessim_mjx import report
     from bayessim_mjx.diagnosis import run
     from bayessim_mjx.diagnosis.fitting.robot import of_file
-    from bayessim_mjx.diagnosis.verdicts import Verdict
+    from bayessim_mjx.diagnosis.result import Verdict
 
     began, effects = time.monotonic(), _names(args.effects)
 

@@ -2,12 +2,16 @@
 
 import os
 import sys
+import traceback
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from bayessim_mjx.errors import UserError, out_of_memory, refused
 
 DEBUG_VARIABLE = "BAYESSIM_MJX_DEBUG"  # set: errors come with a traceback
 BUGS = "to the issue tracker of bayessim_mjx"
+OPENGL = "MUJOCO_GL"  # MuJoCo loads the OpenGL library of this name when it is imported
+LIBRARIES = "egl (Debian: libegl1), osmesa (libosmesa6), glfw (libglfw3, with a screen), or disable (no video)"
 
 
 def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:
@@ -31,9 +35,9 @@ def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:
         except Exception as error:
             if os.environ.get(DEBUG_VARIABLE):
                 raise
-            if not isinstance(error, UserError) and not refused(error):
+            if not isinstance(error, UserError) and not refused(error) and not no_opengl(error):
                 return _bug()
-            print(f"error: {one_line(error)}", file=sys.stderr)
+            print(f"error: {no_opengl(error) or one_line(error)}", file=sys.stderr)
             return 2
 
     main.__doc__ = run.__doc__
@@ -48,10 +52,17 @@ def one_line(error: Exception) -> str:
     return f"{text.rstrip('. ') or 'out of memory'}; lower env.numEnvs, ppo.num_steps or bayessim.trainTrajs"
 
 
+def no_opengl(error: BaseException) -> str:
+    """The message where MuJoCo could not load the OpenGL library that MUJOCO_GL names; "" for any other error."""
+    chosen = os.environ.get(OPENGL, "")
+    files = (Path(frame.f_code.co_filename).parts for frame, _ in traceback.walk_tb(error.__traceback__))
+    if not chosen or not any(parts[-1] == "gl_context.py" and "mujoco" in parts for parts in files):
+        return ""
+    return f"{OPENGL}={chosen}: OpenGL cannot be loaded; allowed: {LIBRARIES}; install it or choose another"
+
+
 def _bug() -> int:
     """The traceback of the present error, and what to do with it."""
-    import traceback
-
     traceback.print_exc()
     print(f"\nThis is a bug: please report it with the lines above and your command, {BUGS}", file=sys.stderr)
     return 1

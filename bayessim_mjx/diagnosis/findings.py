@@ -1,18 +1,21 @@
-"""All that a diagnosis computed, before it is put into words, and who observes it while it runs."""
+"""All that a diagnosis computed, before it is put into words; its stages, and who observes it while it runs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, TypeVar
 
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.logcheck.links import Link
+from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
 from bayessim_mjx.diagnosis.residual.frequency import Heard
 from bayessim_mjx.diagnosis.residual.where import Located
+from bayessim_mjx.diagnosis.selection.budget import Budget, Progress
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
@@ -81,3 +84,84 @@ class Observer:
 
     def verdict(self, found: Findings) -> None:
         """Called with the findings before the optional stages."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage: its name, which is shown while it runs, and `run(findings, say) -> findings`.
+
+    Attributes:
+        optional: the verdict does not need it; its failure becomes a warning.
+        patient: it is left out if the time is over.
+        beside: it needs no result of other such stages, and adds only its own part. Such stages run together, as each
+            compiles a small program, which leaves cores free.
+    """
+
+    name: str
+    run: Callable[[Findings, Progress], Findings]
+    optional: bool = False
+    patient: bool = False
+    beside: bool = False
+
+
+def carry_out(stages: Sequence[Stage], found: Findings, time_left: Budget, observer: Observer) -> Findings:
+    """Run all stages; the observer gets the verdict once all stages that are not optional have run.
+
+    Under a limit of time they run one after the other, and a stage is left out if the time is over at its turn.
+    """
+    beside = [] if time_left.limited else [s for s in stages if s.beside]
+    alone = [s for s in stages if s not in beside]
+    for stage in (s for s in alone if not s.optional):
+        found = _in_time(stage, found, observer.progress, time_left)
+    if beside:
+        found = _together(beside, found, observer)
+    else:
+        observer.verdict(found)
+    for stage in (s for s in alone if s.optional):
+        found = _in_time(stage, found, observer.progress, time_left)
+    return found
+
+
+def _together(stages: Sequence[Stage], found: Findings, observer: Observer) -> Findings:
+    """Run each stage on a thread: compilation and simulation release Python's lock."""
+    name = ", ".join(s.name for s in stages)
+    done: list[Stage] = []
+
+    def one(stage: Stage) -> Findings:
+        after = _after(stage, found, lambda text, done, total: None)
+        done.append(stage)
+        observer.progress(name, len(done), len(stages))
+        return after
+
+    observer.progress(name, 0, len(stages))
+    with ThreadPoolExecutor(len(stages)) as pool:
+        running = {stage.name: pool.submit(one, stage) for stage in stages}
+        needed = [running[s.name] for s in stages if not s.optional]
+        observer.verdict(_joined(found, needed))
+    return _joined(found, running.values())
+
+
+def _joined(found: Findings, running: Iterable[Future[Findings]]) -> Findings:
+    """The findings with the parts and warnings of stages that began with `found`."""
+    each = [future.result() for future in running]
+    parts = {kind: part for after in each for kind, part in after.parts.items()}
+    warnings = [text for after in each for text in after.warnings[len(found.warnings) :]]
+    both = {**found.parts, **parts}
+    return replace(found, parts=MappingProxyType(both), warnings=(*found.warnings, *warnings))
+
+
+def _in_time(stage: Stage, found: Findings, say: Progress, time_left: Budget) -> Findings:
+    if (stage.patient or stage.optional) and time_left.late:
+        return replace(found, warnings=(*found.warnings, notes.out_of_time(stage.name)))
+    say(stage.name, 0, 1)
+    return _after(stage, found, say)
+
+
+def _after(stage: Stage, found: Findings, say: Progress) -> Findings:
+    try:
+        return stage.run(found, say)
+    except Exception as error:
+        if not stage.optional:
+            raise
+        # the verdict stands: a missing picture or proposal must not lose it
+        return replace(found, warnings=(*found.warnings, notes.lost(stage.name, error)))

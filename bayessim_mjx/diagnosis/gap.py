@@ -8,6 +8,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 # Root mean square residual, in noise standard deviations, up to which a model is at the noise. It decides words, and
 # whether the gap is located; verdicts rest on `selection.numbers.FLOOR` and on the force that is left. Counted:
 # docs/decisions/at_noise.md
@@ -66,3 +69,8 @@ def of_rms(before: float, after: float, noise: float = 1.0) -> Gap:
 def of_one(squared: float, noise: float = 1.0) -> Gap:
     """The gap that one model leaves."""
     return Gap(squared, squared, noise)
+
+
+def above_noise(rms: ArrayLike, noise: ArrayLike) -> NDArray[np.float64]:
+    """Root mean square errors without the noise's part; all in one unit."""
+    return np.asarray(np.sqrt(np.maximum(np.square(rms) - np.square(noise), 0.0)))

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import tolerance
 from bayessim_mjx.diagnosis.equation_error import inverse_dynamics_check
 from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.fitting import (
@@ -29,7 +28,8 @@ from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck import gate, noise
-from bayessim_mjx.diagnosis.request import Request
+from bayessim_mjx.diagnosis.phrases import notes
+from bayessim_mjx.diagnosis.request import Request, Tolerance, judge, read
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.search_state import Settings
 from bayessim_mjx.effects.support.motion import AROUND
@@ -65,7 +65,7 @@ class Setup:
     scales: scales.Scales
     settings: Settings
     seed: int
-    tolerance: tolerance.Tolerance
+    tolerance: Tolerance
     warnings: tuple[str, ...] = ()
     said: tuple[str, ...] = ()
     discretisation: discretisation.Discretisation | None = None
@@ -141,20 +141,27 @@ def prepare(
         UserError: unknown effects, no usable log, a tolerance that cannot be read.
         TooLittleData: too few windows.
     """
-    tolerated = tolerance.read(request.tolerances, robot.mj_model)
+    tolerated = read(request.tolerances, robot.mj_model)
     checked = _checked(robot, logs, request, looked)
     usable = checked.gate.usable
     size = scales.measure(checked.robot.mj_model, [resample(log, checked.dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(candidates.kinds_of(request.effects), size)
-    judge = functools.partial(tolerance.judge, checked.robot.mj_model, 2 * size.travel, asked=tolerated)
-    timed = _timed(checked, size, judge(noise.noise_of_positions(usable)).limit, request.group, budget)
+    allows = functools.partial(judge, checked.robot.mj_model, 2 * size.travel, given=tolerated)
+    timed = _timed(checked, size, allows(noise.noise_of_positions(usable)).limit, request.group, budget)
     physics = physics_of(timed.robot, checked.dt, stack)
     cut = timed.cut(physics, request.quick)
     base = candidates.base_coordinates(timed.robot.space, timed.robot.accuracy, timed.robot.assumed)
     led = inverse_dynamics_check.lead(candidates.enumerate_candidates(physics), checked.look)
-    allowed = judge(cut.sigma_q)
+    allowed = allows(cut.sigma_q)
     untried = [f"not tried: {text}" for text in left_out]
-    warnings = [*checked.notes, *timed.notes, *timed.warnings, *untried, *_few_conditions(cut)]
+    warnings = [
+        *checked.notes,
+        *timed.notes,
+        *timed.warnings,
+        *untried,
+        *cut.notes,
+        *notes.conditions(len(cut.groups), cut.blocks),
+    ]
     own = Settings(screened=24) if robot.mj_model.nv > CUTTING.many else Settings()
     settings = request.settings or (QUICK if request.quick else own)
     return Setup(
@@ -167,7 +174,7 @@ def prepare(
         settings=dataclasses.replace(settings, believed=timed.step.believed, budget=budget),
         seed=request.seed,
         tolerance=allowed,
-        warnings=(*warnings, *noise.not_compared(usable), *allowed.warnings(), *led.sentences()),
+        warnings=(*warnings, *noise.not_compared(usable), *notes.below_noise(allowed), *led.sentences()),
         said=timed.notes,
         discretisation=timed.step,
         look=checked.look,
@@ -176,15 +183,15 @@ def prepare(
 
 def _checked(robot: Robot, logs: Sequence[Log], request: Request, looked: Callable[[Look], None]) -> _Checked:
     """The logs after the gate, cut where they begin to be usable, and their notes."""
-    dt, notes = control_period(robot, logs), [*request.notes]
-    found, look = inverse_dynamics_check.checked(logs, robot, dt, notes, looked)
+    dt, said = control_period(robot, logs), [*request.notes]
+    found, look = inverse_dynamics_check.checked(logs, robot, dt, said, looked)
     seconds = at_most(robot.mj_model.nv, request.quick) * (CUTTING.window + AROUND)  # that all windows hold together
     beginnings, shorter = observation.shortened(found.demand(), seconds)
     found = found.of_logs(observation.completed(beginnings, robot.mj_model))
-    notes += [*found.warnings, *shorter, *(f"{text} (found, not assumed)" for text in found.findings)]
-    notes += [] if noise.repeats(found.usable) else [noise.ONCE]
+    said += [*found.warnings, *shorter, *(f"{text} (found, not assumed)" for text in found.findings)]
+    said += [] if noise.repeats(found.usable) else [noise.ONCE]
     period = float(np.median([log.period for log in logs]))
-    return _Checked(pruned(robot, found.usable, dt), dt, period, found, look, tuple(notes))
+    return _Checked(pruned(robot, found.usable, dt), dt, period, found, look, tuple(said))
 
 
 def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | None, budget: Budget) -> _Timed:
@@ -197,8 +204,9 @@ def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | No
     shift = _shift(cuts, step, size)
     late = [] if shift is None else shift.notes(checked.period)
     clocked = checked.gate if shift is None else checked.gate.moved(shift.lead)
-    notes = [*steps.said(), *_faster(usable, float(checked.robot.mj_model.opt.timestep), dt), *late]
-    return _Timed(step.robot(steps.robot), clocked, cuts, step, tuple(notes), tuple(steps.warnings()))
+    period, timestep = float(np.median([log.period for log in usable])), float(checked.robot.mj_model.opt.timestep)
+    said = [*steps.said(), *notes.rows(period, timestep, dt, dt <= 2 * CUTTING.shortest), *late]
+    return _Timed(step.robot(steps.robot), clocked, cuts, step, tuple(said), tuple(steps.warnings()))
 
 
 def _measured(
@@ -239,22 +247,3 @@ def _shift(
     return command_shift.estimate(
         step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
     )
-
-
-def _faster(logs: Sequence[Log], timestep: float, dt: float) -> list[str]:
-    """What logs faster than the simulator, or than the diagnosis goes, are told."""
-    period = float(np.median([log.period for log in logs]))
-    if period < dt * (1 - 1e-6) and dt <= 2 * CUTTING.shortest:
-        return [f"the logs have a row every {1e3 * period:.3g} ms; one every {1e3 * dt:.3g} ms is compared"]
-    if timestep > dt * (1 + 1e-6):
-        text = f"the logs have a row every {1e3 * period:.3g} ms, and the model steps {1e3 * timestep:.3g} ms"
-        return [f"{text}: it is simulated at {1e3 * dt:.3g} ms"]
-    return []
-
-
-def _few_conditions(cut: Windows) -> list[str]:
-    count = len(cut.groups)
-    if cut.blocks:
-        text = "one log is one operating condition: blocks of it in time are held out, so all numbers are in sample"
-        return [*cut.notes, f"{text}, and no interval between conditions is given"]
-    return [*cut.notes, *([f"{count} operating conditions: intervals are rough"] if count < 4 else [])]

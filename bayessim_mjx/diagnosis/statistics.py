@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import nnls
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri, ndtri_exp
 
 Array = NDArray[np.float64]
 
 
-Z90 = 1.645  # half the width of a Gaussian's 90 % interval, in standard deviations; source: its 95 % quantile
+Z90 = float(ndtri(0.95))  # half the width of a Gaussian's 90 % interval, in standard deviations
 RULED = 0.5  # degrees of freedom where one condition rules a mean of squares; coverage as measured, see above
 NOTHING = (float("nan"), float("nan"))  # the interval of one condition
 
@@ -118,14 +118,7 @@ def normal_deviate(x: Array, group: NDArray[np.int64]) -> float:
         return 0.0
     t = float(np.mean(x)) / (float(error(rows @ x / rows.sum(1))) + 1e-12)
     beyond = float(stats.t.logsf(abs(t), freedom(len(x) - rows.sum(1))))
-    return float(np.copysign(_normal_quantile(beyond), t))
-
-
-def _normal_quantile(log_beyond: float) -> float:
-    """The normal deviate that is exceeded with a probability given by its logarithm, up to 1/2."""
-    from scipy.special import ndtri_exp
-
-    return float(-ndtri_exp(min(log_beyond, np.log(0.5))))
+    return float(np.copysign(-ndtri_exp(min(beyond, np.log(0.5))), t))
 
 
 def variance_parts(squares: Array, kinds: Array, rounds: int = 4) -> tuple[Array, Array]:

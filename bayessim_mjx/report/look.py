@@ -22,6 +22,16 @@ STAGE = {
     "noise_floor": "#A6ACB2",
     "measured": "#000000",
 }
+_REPAIRED = ("blue", "#005f96")
+TONES = {  # verdict: (colour on the terminal, on the page)
+    "no_gap": ("green", "#00755a"),
+    "parameters": _REPAIRED,
+    "noise": _REPAIRED,
+    "effects": _REPAIRED,
+    "ambiguous": ("yellow", "#8a5a00"),
+    "unexplained": ("red", "#b14a00"),
+    "insufficient_data": ("white", "#5b6670"),
+}
 DASH = {"nominal": "dot", "calibrated": "dash", "with_effects": "solid", "measured": "solid"}
 HATCH = {"nominal": "", "calibrated": "", "with_effects": "", "reducible_floor": "/", "noise_floor": "."}
 OVER = {"fillmode": "overlay", "fgcolor": "white", "size": 6}  # hatching over the colour

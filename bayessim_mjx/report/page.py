@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.report import evidence, sections
-from bayessim_mjx.report.look import COLUMN, STAGE, WIDTH
+from bayessim_mjx.report.look import COLUMN, STAGE, TONES, WIDTH
 from bayessim_mjx.report.words import STAGES, not_fitted, page
 
 TEMPLATE = "template.html.j2"
@@ -46,6 +46,7 @@ def render(d: Diagnosis, missed: Any = None, link: str = "", folder: Path = Path
         stage_names=STAGES,
         stage_colours=STAGE,
         verdict=d.verdict,
+        tone=TONES[d.verdict][1],
         top=sections.top(d, folder),
         about=sections.about(d),
         gap=sections.how_far(d),

@@ -11,20 +11,12 @@ from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.tables import TIE
 from bayessim_mjx.quantities import finite
+from bayessim_mjx.report.look import TONES
 from bayessim_mjx.report.words import MISSING, between, closure, estimate, not_fitted, number, percent, quantity
 
 BEST = 8  # candidates; no source: a matter of style
 NOT_FITTED = 6  # named for each reason; diagnosis.json has all; no source: a matter of style
 Table = tuple[list[str], list[list[str]], tuple[int, ...]]  # header, rows, columns of words
-COLOURS = {
-    "no_gap": "green",
-    "parameters": "blue",
-    "noise": "blue",
-    "effects": "blue",
-    "ambiguous": "yellow",
-    "unexplained": "red",
-    "insufficient_data": "white",
-}
 FILES = ("report.html", "diagnosis.json", "effects.yaml", "model_with_effects.xml")
 
 
@@ -39,7 +31,7 @@ def console(
         headless: no control characters, as where there is no terminal.
     """
     with Console(file=file, headless=headless) as out:
-        out.panel(verdict_of(diagnosis).badge, _first(diagnosis), COLOURS[diagnosis.verdict])
+        out.panel(verdict_of(diagnosis).badge, _first(diagnosis), TONES[diagnosis.verdict][0])
         if folder is not None and (text := command(diagnosis, folder)):
             out.command("next", text)
         for warning in diagnosis.warnings:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bayessim_mjx.diagnosis.result import Diagnosis
-from bayessim_mjx.diagnosis.verdicts import Verdict as Title
+from bayessim_mjx.diagnosis.result import Verdict as Title
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from scipy.special import ndtri
+
 from bayessim_mjx import effects as library
 from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.correction import Estimate, FoundEffect
+from bayessim_mjx.diagnosis.selection.numbers import ODDS
 from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import finite, listed, percent
 
@@ -27,9 +30,9 @@ RECIPROCALS = {
 }
 WRONG = "the true "  # begins the words for an effect whose number the simulator has, but not right
 MOST = 6  # things that a sentence lists: all joints of an arm; a rule of thumb
-# standard deviations from neutral, or from the data sheet: one normal number in 22 is further away by chance; false
-# reports of fitted values were not counted
-CLEAR = 2.0
+# standard deviations, 1.98: the odds of a normal number against so large a chance deviation are strong (`Odds.strong`);
+# false reports of fitted values were not counted
+CLEAR = -float(ndtri(0.5 / (1.0 + ODDS.strong)))
 
 
 def missing(name: str, where: str) -> str:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bayessim_mjx.diagnosis import tolerance
-from bayessim_mjx.diagnosis.gap import of_one, of_rms
+from bayessim_mjx.diagnosis.gap import above_noise, of_one, of_rms
 from bayessim_mjx.diagnosis.phrases import effects as named
 from bayessim_mjx.diagnosis.phrases import parameters, residual
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
@@ -243,7 +242,7 @@ def _within(far: Gap) -> str:
         return ""
     row = far.physical[name]
     noise, unit = row.get("noise", 0.0), row["unit"]
-    above = float(tolerance.above_noise(row["with_effects"], noise))
+    above = float(above_noise(row["with_effects"], noise))
     return f"{name}, {extent(above, unit)} above the noise, of {extent(max(row['tolerance'], noise), unit)}"
 
 

@@ -15,17 +15,17 @@ from bayessim_mjx.diagnosis.findings import Findings, Where
 from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.phrases import first_look, residual
 from bayessim_mjx.diagnosis.phrases.verdict import horizon_warning, sentences
+from bayessim_mjx.diagnosis.request import length_unit
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap, Place
 from bayessim_mjx.diagnosis.selection import bounds
 from bayessim_mjx.diagnosis.selection.budget import SINGLES
 from bayessim_mjx.diagnosis.selection.models import BASE, systematic
+from bayessim_mjx.diagnosis.selection.numbers import HIDDEN
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, ranked
-from bayessim_mjx.diagnosis.summary import effects_found, how_far, known_parameters
-from bayessim_mjx.diagnosis.summary.finer_steps import AtFinerSteps
+from bayessim_mjx.diagnosis.summary import estimates, how_far
+from bayessim_mjx.diagnosis.summary.again import AtFinerSteps, Whole
 from bayessim_mjx.diagnosis.summary.verdict import Verdict, force_in_numbers, verdict_of
-from bayessim_mjx.diagnosis.summary.whole_logs import Whole
-from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
 from bayessim_mjx.logs.log import Channels
 
@@ -42,12 +42,12 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     own = selection.estimated
     together = own.covariance + np.diag(systematic(model, setup.fitter.simulator.windows.dt) ** 2)
     finer = found.part(AtFinerSteps)
-    steps = finer.notes(found, together) if finer else []
+    steps = finer.notes(model, together) if finer else []
     base = len(setup.fitter.base)
     together = _told(found, together + finer.covariance(base) if finer else together)
     sd = np.sqrt(np.diag(together))
-    closed = effects_found.closed_by(found)
-    effects = effects_found.effects_of(found, sd, closed)
+    closed = estimates.closed_by(found)
+    effects = estimates.effects_of(found, sd, closed)
     far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
     verdict = verdict_of(found, far)
     known = own.mean[:base] + (finer.shift[:base] if finer else 0.0)
@@ -64,9 +64,9 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         effects=effects,
         where=residual.places(where.found) if where and where.found.spots else _where(found),
         gap=far,
-        parameters=known_parameters.parameters(selection, model, sd, known),
+        parameters=estimates.parameters(selection, model, sd, known),
         candidates=ranking(selection.state),
-        warnings=[*notes, *known_parameters.less_accurate(model, own.sheet), *found.warnings],
+        warnings=[*notes, *estimates.less_accurate(model, own.sheet), *found.warnings],
         next_experiment=experiment,
         versions=versions.of(PACKAGES),
         details=details(found, effects, closed) | more,
@@ -74,9 +74,9 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         not_fitted=not_fitted(selection.state),
         about={**about, "conditions": setup.fitter.simulator.windows.conditions} if about else {},
         hidden=list(selection.hidden),
-        accuracy=known_parameters.accuracy(model, own.sheet),
+        accuracy=estimates.accuracy(model, own.sheet),
         evidence=selection.weighed.to_dicts(),
-        answers=effects_found.answers(effects, experiment),
+        answers=estimates.answers(effects, experiment),
         basis=basis(found, verdict),
     )
     rivals = residual.black_boxes(found.part(BlackBoxes), setup.fitter.simulator.windows.blocks)
@@ -206,12 +206,9 @@ def _reason(state: SearchState, label: str, gains: dict[str, float]) -> str:
     return phrases.LESS_PROMISING if state.above_noise(state.base) else phrases.NOTHING_LEFT
 
 
-MANY = 24  # candidates in the isolability matrix, overlays in the report: a page of a few MB; a rule of thumb
-
-
 def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any]) -> dict[str, Any]:
     model, cut = found.model, found.setup.fitter.simulator.windows
-    each, deviation = known_parameters.per_condition(found.setup.fitter, model)
+    each, deviation = estimates.per_condition(found.setup.fitter, model)
     names = model.fit.names
     return {
         "effect_specs": {e.name: spec_of(e) for e in found.setup.physics.effects if e.quantities},
@@ -288,7 +285,7 @@ def _overlays(found: Findings) -> list[dict[str, Any]]:
         own = np.flatnonzero(cut.log == r)
         for joint in range(model.njnt):
             q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-            if int(model.jnt_type[joint]) not in (2, 3) or len(out) >= MANY or not len(own) or not log.seen_dofs[v]:
+            if int(model.jnt_type[joint]) not in (2, 3) or not len(own) or not log.seen_dofs[v]:
                 continue
             rows = np.concatenate([np.arange(cut.start[w] + 1, cut.start[w] + 1 + cut.steps) for w in own])
             entry: dict[str, Any] = {
@@ -306,7 +303,7 @@ def _overlays(found: Findings) -> list[dict[str, Any]]:
 
 def _isolability(of: SearchState) -> dict[str, Any]:
     """|cos| between what the candidates change in the residual, known parameters and starts projected out."""
-    some = [s for s in of.screened if s.absorbed < 0.999][:MANY]
+    some = [s for s in of.screened if s.absorbed < HIDDEN]
     if len(some) < 2:
         return {}
     columns = np.stack([s.column.reshape(-1) for s in some])

@@ -7,7 +7,7 @@ import dataclasses
 
 from bayessim_mjx.diagnosis.phrases import advice, parameters, verdict
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect, Gap
-from bayessim_mjx.diagnosis.summary.effects_found import answers
+from bayessim_mjx.diagnosis.summary.estimates import answers
 
 ROW = {
     "nominal": 0.0214, "calibrated": 0.0107, "with_effects": 0.000866, "unit": "rad", "tolerance": 0.02,
