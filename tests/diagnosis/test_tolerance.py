@@ -186,7 +186,7 @@ def test_what_windows_hide_is_told_of_whole_logs(rms, beyond, times):
 
 def test_the_headline_says_partly_explained_and_what_remains_where():
     head, *rest = said("unexplained", [FRICTION], gap(0.0349))
-    assert head.startswith("Partly explained: the simulator lacks Coulomb friction at elbow; more than the tolerance")
+    assert head.startswith("Partly explained: the simulator lacks Coulomb friction at elbow. More than the tolerance")
     assert "elbow: 2.0 deg rms, 6.0 deg at most (3.5 % of its motion; tolerance 1.1 deg)" in head
     assert "shoulder" not in head and any(text.startswith("By joint") for text in rest)
     head, *rest = said("effects", [FRICTION], gap(0.0132))

@@ -194,7 +194,7 @@ def answer(effect: FoundEffect, found: Mapping[str, Any]) -> str:
         size = spanned(number["mean"], number["low"], number["high"], number["unit"])
         rest = [title for title, m in zip(titles, each, strict=True) if m[1:] or m[0] not in number["effects"]]
         text = f"{size}{_way(number)}, by {any_of(number['effects'])}"
-        text += f"; or, with another number, {listed(rest, 'or')}" if rest else ""
+        text += f". With another number: {listed(rest, 'or')}" if rest else ""
     return f"These logs fit {len(each)} explanations alike: {text}."
 
 

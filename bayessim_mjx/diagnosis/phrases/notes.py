@@ -91,8 +91,8 @@ def whole_logs(
     if chaotic:
         used = f"they count up to there, {seconds:.2g} s at most" if kept else "they are not counted"
         out.append(
-            f"unstable or chaotic motion: in {_some(chaotic, names)} the uncertain start alone exceeds the tolerance; "
-            f"no simulator can predict them whole, and {used}"
+            f"unstable or chaotic motion: in {_some(chaotic, names)} the uncertain start alone exceeds the tolerance. "
+            f"No simulator can predict them whole: {used}"
         )
     if broken:
         out.append(f"simulated open loop, {_some(broken, names)} diverge: whole logs are compared without them")

@@ -11,8 +11,8 @@ from bayessim_mjx.quantities import listed
 STUCK = "At a bound: {named}. They stand in for something missing, or their ranges are too narrow."
 FAR = "Far from the data sheet: {named}."
 STANDS_FOR = (
-    "These logs do not separate a wrong data sheet at {parameters} from {effects}: both move the robot alike. "
-    "--accuracy states how accurate the data sheet is."
+    "A wrong data sheet at {parameters} moves the robot in these logs as {effects} would. --accuracy states "
+    "the accuracy of the data sheet."
 )
 
 

@@ -19,23 +19,23 @@ HEADS = {
     "unexplained": "No effect of the library explains the gap: recalibration leaves {calibrated}.",
 }
 SMALL = " This exceeds the noise, but is too small to identify a cause."  # where the residual is above the noise
-PARTLY_HEAD = "Partly explained: {named}; more than the tolerance remains at {beyond}."
+PARTLY_HEAD = "Partly explained: {named}."
 REST = "More than the tolerance remains at {beyond}."
 IMPERFECT = "No candidate closes the rest, {rest} of the squared gap: the law is not quite that of the real system."
-NEAREST = "Nearest in the library: {nearest}."
+NEAREST = "Nearest effects of the library: {nearest}."
 LITTLE = "This is less than half: {they} {explain} little of the gap."
-ON_TOP = "Beside {them} a force is missing: it makes {remains} of the squared gap."
+ON_TOP = "Beside {them} a force is missing: that force makes {remains} of the squared gap."
 FALLS = (
-    "On held-out {held} {they} {reduce} the gap from {calibrated} to {with_effects}: {shown} of the squared gap above "
-    "the noise is closed."
+    "On held-out {held} {they} {reduce} the gap from {calibrated} to {with_effects}. This closes {shown} of the "
+    "squared gap above the noise."
 )
 PROMISED = (
-    "Before any fit, one linear step predicted {predicted}. With {them} {nested} without each {one} in turn, and "
-    "with the noise of the residuals as floor, {realised} is closed."
+    "Before any fit, one linear step predicted {predicted}. {nested} without each {one} in turn, {they} {close} "
+    "{realised} (floor: the noise of the residuals)."
 )
 ELSEWHERE = (
-    "If the effects are only chosen without each condition in turn, they close {elsewhere} of its gap; the fits behind "
-    "the choice had seen it, so these shares may be a little too high."
+    "Only chosen without it, {they} {close} {elsewhere}. Both shares may be a little too high: the fits that the "
+    "choice compares had seen every condition."
 )
 IN_SAMPLE = "These numbers are in sample: one log is one operating condition, and other conditions may differ."
 WITHIN = "Every joint is within its tolerance (closest: {within})."
@@ -44,10 +44,10 @@ PROBABLE = (
     "parameters alone: {nothing}."
 )
 SPLITS = "To separate them, run the next experiment: {name}."
-HIDDEN = "Beside {them} these logs would not show {hidden}: numbers of {them} have the same influence on the motion."
+HIDDEN = "Beside {them} these logs would not show {hidden}: {their} numbers change the motion alike."
 BUILDS_UP = (
-    "Over whole logs the error grows to {times} times the size that noise, start and parameters explain, though it "
-    "hardly shows within {window}: the law or the simulator's time step is not quite right."
+    "Over whole logs the error is {times} times as large as noise, start and parameters explain. Within {window} it "
+    "hardly shows. The law or the simulator's time step is not quite right."
 )
 BENT = (
     "The effects need {far} of {known} known parameters far from the data sheet. Less than 1 of 10 000 robots is so by "
@@ -56,12 +56,12 @@ BENT = (
 )
 OF_SENSORS = "The residual has the covariance of sensor noise, {colour}."
 CHANCE = (
-    "No candidate and no flexible force predicts the residual, {calibrated}, on held-out {held}: process noise, an "
-    "input that was not logged, or noise larger than estimated."
+    "No candidate and no flexible force predicts the residual, {calibrated}, on held-out {held}. Possible causes: "
+    "process noise, an input that was not logged, or noise larger than estimated."
 )
 COASTS = (
-    "Joints that keep their speed in each window, without any simulator, are {coasting} noise sd off, less than the "
-    "recalibrated simulator's {calibrated}: its forces are far off, or hardly show in such short windows.{more}"
+    "Without any simulator, joints that keep their speed are {coasting} noise sd off, less than the recalibrated "
+    "simulator's {calibrated}. Its forces are far off, or hardly show in such short windows.{more}"
 )
 COASTS_CLOSED = " The effects close {closed} of the squared gap of such joints."
 
@@ -75,7 +75,8 @@ def sentences(d: Diagnosis) -> list[str]:
     them = "it" if len(d.effects) == 1 else "them"
     members = {label for a in d.answers for m in a["members"] for label in m["effects"]}
     hidden = [label for label in d.hidden if label not in members]  # a class already says that they are not separated
-    texts += [HIDDEN.format(them=them, hidden=named.any_of(hidden, named.MOST))] if hidden else []
+    their = "its" if len(d.effects) == 1 else "their"
+    texts += [HIDDEN.format(them=them, their=their, hidden=named.any_of(hidden, named.MOST))] if hidden else []
     texts += _noise(d)
     if d.verdict == "unexplained" and basis.get("flexible"):
         texts += residual.flexible(basis["flexible"], far.in_sample)
@@ -96,7 +97,9 @@ def _head(d: Diagnosis) -> str:
         head = HEADS["no_gap"].partition(": ")[2] if above and d.verdict == "no_gap" else HEADS[d.verdict]
         return named.capital((head + SMALL * above).format(**fill))
     if d.verdict == "unexplained":
-        return (PARTLY_HEAD if far.beyond else HEADS["unexplained"]).format(named=named.lacking(d.effects), **fill)
+        return (f"{PARTLY_HEAD} {REST}" if far.beyond else HEADS["unexplained"]).format(
+            named=named.lacking(d.effects), **fill
+        )
     several = {a["effect"]: a for a in d.answers if len(a["members"]) > 1}
     open_ = [named.answer(e, several[label]) for e in d.effects if (label := f"{e.name}@{e.where}") in several]
     sure = [e for e in d.effects if f"{e.name}@{e.where}" not in several]
@@ -118,7 +121,8 @@ def _fill(d: Diagnosis) -> dict[str, str]:
         "beyond": listed([_left(n, far.physical[n]) for n in worst if n in far.beyond], most=3),
         "within": _within(far),
         "shown": percent(of_rms(far.calibrated, far.with_effects).closed),
-        "nested": "chosen and fitted" if far.closed.get("nested") else "fitted",
+        "nested": "Chosen and fitted" if far.closed.get("nested") else "Fitted",
+        "close": "closes" if one else "close",
         "rest": percent(of_rms(far.calibrated, far.with_effects).left),
         **{k: percent(far.closed.get(k)) for k in ("predicted", "realised", "elsewhere")},
     }
@@ -172,9 +176,9 @@ def _probable(basis: Mapping[str, Any]) -> str:
     chance = basis.get("probability")
     if not chance:
         return ""
-    nothing = percent(chance["nothing"])
+    own, others, nothing = (percent(chance[k]) for k in ("answer", "rivals", "nothing"))
     nothing = nothing if nothing.strip("0. %") else "less than one in a million"  # by the digits of `percent`
-    return PROBABLE.format(own=percent(chance["answer"]), others=percent(chance["rivals"]), nothing=nothing)
+    return PROBABLE.format(own=own, others=others if chance["rivals"] else "none has any", nothing=nothing)
 
 
 def coasting(far: Gap, named: bool) -> str:
@@ -265,12 +269,10 @@ def number(value: float) -> str:
 
 
 def horizon_warning(far: Gap) -> list[str]:
-    """A share that changes with the horizon is flagged."""
+    """Warn of a share closed that changes with the horizon: of one horizon its interval lies above another's."""
     loud = [row for row in far.horizons if not of_one(row["calibrated"] ** 2).at_noise]
+    ends = [[of_rms(row["calibrated"], level).closed for level in row["ci"]["with_effects"]] for row in loud]
+    differ = len(loud) > 1 and max(least for _, least in ends) > min(most for most, _ in ends)
     closed = {row["name"]: of_rms(row["calibrated"], row["with_effects"]).closed for row in loud}
-    differ = len(closed) > 1 and max(closed.values()) - min(closed.values()) >= DEPENDS
     shares = ", ".join(f"{percent(share)} ({name})" for name, share in closed.items())
     return [f"the share of the gap that is closed depends on the horizon: {shares}"] if differ else []
-
-
-DEPENDS = 0.3  # shares closed at two horizons that differ by more are warned of; a rule of thumb

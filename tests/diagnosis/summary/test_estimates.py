@@ -11,7 +11,7 @@ from bayessim_mjx.diagnosis.summary import estimates
 
 
 @pytest.mark.parametrize(
-    ("deviation", "sentence"), [(2.0, "To previous is not identified by these logs."), (0.9, ""), (0.001, "")]
+    ("deviation", "sentence"), [(2.0, "To previous is not identified by these logs."), (0.5, ""), (0.001, "")]
 )
 def test_a_share_that_reaches_no_joint_is_said_to_be_unidentified(monkeypatch, deviation, sentence):
     """A drive at the end of a chain has one neighbour; ranges are from -1 to 1."""
