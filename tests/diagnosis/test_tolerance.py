@@ -191,7 +191,7 @@ def test_the_headline_says_partly_explained_and_what_remains_where():
     assert "shoulder" not in head and any(text.startswith("By joint") for text in rest)
     head, *rest = said("effects", [FRICTION], gap(0.0132))
     assert head == "The simulator lacks Coulomb friction at elbow."
-    assert rest[-1] == "Every joint is within its tolerance (closest: elbow, 0.76 deg above the noise, of 1.1 deg)."
+    assert rest[-1] == "Every joint is within its tolerance (closest: elbow, 0.76 deg of 1.1 deg, noise subtracted)."
 
 
 def test_what_no_effect_explains_is_told_against_the_tolerance_too():

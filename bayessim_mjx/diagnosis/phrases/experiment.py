@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 from bayessim_mjx.effects.support.words import words
-from bayessim_mjx.quantities import listed
+from bayessim_mjx.quantities import percent
 
 
 def known_payload(mass: float, place: str) -> tuple[str, str]:
@@ -53,8 +53,11 @@ def sharpens(action: str, parameter: str, before: float, after: float) -> str:
 
 
 def sharpens_little(best: str, parameter: str, before: float, after: float) -> str:
-    """Why an experiment does not help, of its name and the parameter that it measures best."""
-    return f"no experiment of the menu adds much; the best, {sharpens(best, parameter, before, after)}"
+    """Say that no experiment helps; best: its name, with the parameter that it measures best."""
+    left = percent(after / before)
+    return (
+        f"no experiment of the menu adds much; the best, {best}, leaves {left} of the standard deviation of {parameter}"
+    )
 
 
 def separates_nobody(labels: Sequence[str], best: str, evidence: float, help: str) -> str:
@@ -72,4 +75,4 @@ def tells_apart(action: str, labels: Sequence[str], evidence: float, contested: 
 
 
 def _apart(labels: Sequence[str], word: str = "from") -> str:
-    return f"{labels[0]} {word} {listed(labels[1:])}"
+    return f"{labels[0]} {word} {', or '.join(labels[1:])}"  # labels may hold an "and"

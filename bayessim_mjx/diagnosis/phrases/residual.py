@@ -182,13 +182,18 @@ def flexible_of(found: Flexible, on: str) -> dict[str, Any]:
     return {"on": on, "held": held, "joints": joints, "inputs": inputs}
 
 
+def predicts(found: Mapping[str, Any]) -> bool:
+    """Whether a flexible force predicts a part of the residual, held out one way or the other; `flexible_of`."""
+    return any(held["significant"] for held in found["held"].values())
+
+
 def flexible(found: Mapping[str, Any], one_log: bool = False) -> list[str]:
     """The part of a model's residual that a flexible force removes, its place and its inputs; `flexible_of`."""
     names = ("by part of the log" if one_log else "by condition", "in time")
     held = dict(zip(names, (found["held"]["condition"], found["held"]["interpolation"]), strict=True))
     of = "with the effects" if found["on"] == "effects" else "of the recalibrated simulator"
-    if not any(h["significant"] for h in held.values()):
-        return [f"A flexible force predicts nothing of the residual {of} on data not used for fitting."]
+    if not predicts(found):
+        return [f"A flexible force of motion and effort predicts nothing of the residual {of} on held-out data."]
     if not (loud := {how: h for how, h in held.items() if not h["at_noise"]}):
         return [f"The residual {of} lies within the measurement noise; a flexible force still predicts a part of it."]
     (first, own), *others = loud.items()

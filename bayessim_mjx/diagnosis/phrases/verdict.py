@@ -23,7 +23,7 @@ PARTLY_HEAD = "Partly explained: {named}."
 REST = "More than the tolerance remains at {beyond}."
 IMPERFECT = "No candidate closes the rest, {rest} of the squared gap: the law is not quite that of the real system."
 NEAREST = "Nearest effects of the library: {nearest}."
-LITTLE = "This is less than half: {they} {explain} little of the gap."
+LITTLE = "At most half is closed: {they} {explain} little of the gap."
 ON_TOP = "Beside {them} a force is missing: that force makes {remains} of the squared gap."
 FALLS = (
     "On held-out {held} {they} {reduce} the gap from {calibrated} to {with_effects}. This closes {shown} of the "
@@ -40,9 +40,9 @@ ELSEWHERE = (
 IN_SAMPLE = "These numbers are in sample: one log is one operating condition, and other conditions may differ."
 WITHIN = "Every joint is within its tolerance (closest: {within})."
 PROBABLE = (
-    "Probability of this explanation among all fitted ones: {own}; of its rivals together: {others}; of the known "
-    "parameters alone: {nothing}."
+    "Probability among all fitted explanations: {own} for this one, {others}, {nothing} for the known parameters alone."
 )
+PAST = "The missing force depends on something else, such as the past of the motion."
 SPLITS = "To separate them, run the next experiment: {name}."
 HIDDEN = "Beside {them} these logs would not show {hidden}: {their} numbers change the motion alike."
 BUILDS_UP = (
@@ -69,7 +69,7 @@ COASTS_CLOSED = " The effects close {closed} of the squared gap of such joints."
 def sentences(d: Diagnosis) -> list[str]:
     """The verdict, most important first; each number is one of the result's."""
     far, basis = d.gap, d.basis
-    texts = [_head(d), *_how_far(d), *_doubts(d), coasting(far, bool(d.effects)), _probable(basis)]
+    texts = [_head(d), *_how_far(d), *_doubts(d), coasting(far, bool(d.effects)), _probable(d)]
     ambiguous = [found for found in d.answers if len(found["members"]) > 1]
     texts += [SPLITS.format(name=d.next_experiment["name"])] if any(a["splits"] for a in ambiguous) else []
     them = "it" if len(d.effects) == 1 else "them"
@@ -80,6 +80,7 @@ def sentences(d: Diagnosis) -> list[str]:
     texts += _noise(d)
     if d.verdict == "unexplained" and basis.get("flexible"):
         texts += residual.flexible(basis["flexible"], far.in_sample)
+        texts += [PAST] if basis.get("remains") and not residual.predicts(basis["flexible"]) else []
     if basis.get("efforts"):
         texts.append(f"By the logged efforts alone, {basis['efforts']}.")
     texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
@@ -167,18 +168,19 @@ def _noise(d: Diagnosis) -> list[str]:
     memory, fill = d.basis.get("noise_memory"), _fill(d)
     if memory is not None and (d.verdict == "noise" or d.gap.beyond or not of_one(d.gap.with_effects**2).at_noise):
         return [OF_SENSORS.format(colour=f"correlated over about {1e3 * memory:.2g} ms" if memory else "white")]
-    held = (d.basis.get("flexible") or {}).get("held", {})
-    predicted = any(h["significant"] for h in held.values())
+    predicted = bool(d.basis.get("flexible")) and residual.predicts(d.basis["flexible"])
     return [CHANCE.format(**fill)] if d.basis.get("above_noise") and not d.effects and not predicted else []
 
 
-def _probable(basis: Mapping[str, Any]) -> str:
-    chance = basis.get("probability")
-    if not chance:
+def _probable(d: Diagnosis) -> str:
+    """The probability of the named effects, where they are the explanation."""
+    chance = d.basis.get("probability")
+    if not chance or (d.verdict == "unexplained" and not d.gap.beyond):
         return ""
     own, others, nothing = (percent(chance[k]) for k in ("answer", "rivals", "nothing"))
     nothing = nothing if nothing.strip("0. %") else "less than one in a million"  # by the digits of `percent`
-    return PROBABLE.format(own=own, others=others if chance["rivals"] else "none has any", nothing=nothing)
+    others = f"{others} for its rivals together" if chance["rivals"] else "none for rivals"
+    return PROBABLE.format(own=own, others=others, nothing=nothing)
 
 
 def coasting(far: Gap, named: bool) -> str:
@@ -247,16 +249,16 @@ def _within(far: Gap) -> str:
     row = far.physical[name]
     noise, unit = row.get("noise", 0.0), row["unit"]
     above = float(above_noise(row["with_effects"], noise))
-    return f"{name}, {extent(above, unit)} above the noise, of {extent(max(row['tolerance'], noise), unit)}"
+    return f"{name}, {extent(above, unit)} of {extent(max(row['tolerance'], noise), unit)}, noise subtracted"
 
 
 def _by_joint(far: Gap, effects: bool) -> str:
-    """`By joint, recalibrated and with the effects: elbow 1.2 deg, 0.05 deg; ...`, the worst first."""
+    """`By joint, without and with the effects: elbow 1.2 deg to 0.05 deg; ...`, the worst first."""
     stages = ("calibrated", "with_effects") if effects else ("nominal", "calibrated")
-    words = "recalibrated and with the effects" if effects else "as delivered and recalibrated"
+    words = "without and with the effects" if effects else "before and after recalibration"
     names = _worst(far)
     rows = [
-        f"{n} {', '.join(extent(far.physical[n][s], far.physical[n]['unit']) for s in stages)}"
+        f"{n} {' to '.join(extent(far.physical[n][s], far.physical[n]['unit']) for s in stages)}"
         for n in names[: named.MOST]
     ]
     more = f"; {len(names) - named.MOST} more in the table" if len(names) > named.MOST else ""
@@ -274,5 +276,5 @@ def horizon_warning(far: Gap) -> list[str]:
     ends = [[of_rms(row["calibrated"], level).closed for level in row["ci"]["with_effects"]] for row in loud]
     differ = len(loud) > 1 and max(least for _, least in ends) > min(most for most, _ in ends)
     closed = {row["name"]: of_rms(row["calibrated"], row["with_effects"]).closed for row in loud}
-    shares = ", ".join(f"{percent(share)} ({name})" for name, share in closed.items())
-    return [f"the share of the gap that is closed depends on the horizon: {shares}"] if differ else []
+    each = [f"{percent(share) if share > 0 else 'none'} ({name})" for name, share in closed.items()]
+    return [f"the share of the gap that is closed depends on the horizon: {', '.join(each)}"] if differ else []

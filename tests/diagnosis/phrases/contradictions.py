@@ -107,8 +107,8 @@ def _quoted(said: Said) -> Iterator[tuple[str, str]]:
         "without it, the effects close": [closed.get("elsewhere")],
         r"closes the rest,": [1.0 - sheet["effects"]],
         r"that force makes": [basis.get("remains")],
-        r"among all fitted ones:": [chance.get("answer")],
-        r"rivals together:": [chance.get("rivals")],
+        "among all fitted explanations:": [chance.get("answer")],
+        "for this one,": [chance.get("rivals")],
         r"force removes": held,
         r"The effects close": [max(sheet["coasting"], 0.0)],
     }
@@ -234,7 +234,10 @@ def main(paths: list[str]) -> None:
     files = 0
     for path in paths:
         said = json.loads(Path(path).read_text())
-        found = contradictions(said.get("said", said))
+        said = said.get("said", said)
+        details = Path(path).with_name("details.json")  # has the shares of the black boxes
+        more = json.loads(details.read_text()).get("black_boxes") if details.is_file() else None
+        found = contradictions(said | {"black_boxes": more})
         files += bool(found)
         kinds.update(kind for kind, _ in found)
         for kind, text in found:

@@ -27,7 +27,7 @@ def test_no_made_up_result_contradicts_itself(name):
         ("one effect", "closes 100 % of the squared gap above", "closes 80 % of the squared gap above", "share"),
         ("one effect", "predicted 66 %", "predicted 97 %", "share"),
         ("one effect", "in turn, the effect closes 98 %", "in turn, the effect closes 66 %", "share"),
-        ("one effect", "fitted ones: 90 %", "fitted ones: 8.0 %", "share"),
+        ("one effect", "explanations: 90 %", "explanations: 8.0 %", "share"),
         ("a remainder", "closes the rest, 7.0 %", "closes the rest, 66 %", "share"),
         ("partly", "that force makes 20 %", "that force makes 80 %", "share"),
         ("partly", "force removes 75 %", "force removes 20 %", "share"),
@@ -48,7 +48,7 @@ def test_no_made_up_result_contradicts_itself(name):
         ("unexplained", "This force acts", "No candidate and no flexible force predicts it. It acts", "predicts"),
         (
             "unexplained by chance",
-            "A flexible force predicts nothing",
+            "A flexible force of motion and effort predicts nothing",
             "A flexible force still predicts a part",
             "predicts",
         ),
