@@ -201,8 +201,9 @@ def _unit(setup: Setup, effect: Candidate, unit: str) -> str:
         return unit
     if joint < 0 or int(model.jnt_type[joint]) != 2:
         return unit
-    special = {"rad/(N m)": "m/N", "N m s": "N s/m"}
-    return special.get(unit, unit.replace("kg m^2", "kg").replace("N m", "N").replace("rad", "m"))
+    if unit == "N m s":
+        return "N s/m"
+    return unit.replace("kg m^2", "kg").replace("N m", "N").replace("(N)", "N").replace("rad", "m")
 
 
 def parameters(selection: Selection, model: Model, sd: Array, mean: Array) -> dict[str, dict[str, Any]]:
