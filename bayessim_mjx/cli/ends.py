@@ -15,7 +15,7 @@ LIBRARIES = "egl (Debian: libegl1), osmesa (libosmesa6), glfw (libglfw3, with a 
 
 
 def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:
-    """A `main(argv=None)` that returns an exit code.
+    """Return a `main(argv=None)` that returns an exit code.
 
     0; 2 and one line on stderr for what the user can mend; 1 and a traceback for a bug; 130 after Ctrl-C.
     """
@@ -45,7 +45,7 @@ def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:
 
 
 def one_line(error: Exception) -> str:
-    """The message without line ends; where memory was short, with the settings to lower."""
+    """Return the message without line ends; where memory was short, with the settings to lower."""
     text = " ".join(str(error).split("\n"))
     if not out_of_memory(error):
         return text
@@ -53,7 +53,7 @@ def one_line(error: Exception) -> str:
 
 
 def no_opengl(error: BaseException) -> str:
-    """The message where MuJoCo could not load the OpenGL library that MUJOCO_GL names; "" for any other error."""
+    """Return the message where MuJoCo cannot load the OpenGL library that MUJOCO_GL names; "" for any other error."""
     chosen = os.environ.get(OPENGL, "")
     files = (Path(frame.f_code.co_filename).parts for frame, _ in traceback.walk_tb(error.__traceback__))
     if not chosen or not any(parts[-1] == "gl_context.py" and "mujoco" in parts for parts in files):
@@ -62,7 +62,7 @@ def no_opengl(error: BaseException) -> str:
 
 
 def _bug() -> int:
-    """The traceback of the present error, and what to do with it."""
+    """Print the traceback of the present error, and where to report it."""
     traceback.print_exc()
     print(f"\nThis is a bug: please report it with the lines above and your command, {BUGS}", file=sys.stderr)
     return 1

@@ -107,7 +107,7 @@ class Source(Protocol):
 
 
 def effects_of(diagnosis: Found) -> tuple[Effect, ...]:
-    """The effects found, with nominal = identified mean and prior Gaussian(mean, sd) truncated to a sensible range.
+    """Return the effects found, with nominal = identified mean and prior Gaussian(mean, sd), truncated to a range.
 
     One effect at several places is one `Effect` with values of its own at each; "all" is tied. Their order is the
     library's, as in the diagnosis (`in_order`).
@@ -134,7 +134,7 @@ def _effect(kind: type[Effect], found: list[FoundEffect]) -> Effect:
 
 
 def _in_order(kind: type[Effect], found: FoundEffect) -> list[Estimate]:
-    """The estimates of one place in the order of the effect's quantities."""
+    """Return the estimates of one place in the order of the effect's quantities."""
     names = [q.name for q in kind.quantities]
     for name in names:
         if name not in found.parameters or not math.isfinite(found.parameters[name].mean):
@@ -144,7 +144,7 @@ def _in_order(kind: type[Effect], found: FoundEffect) -> list[Estimate]:
 
 
 def _identified(p: Parameter, q: Quantity, e: Estimate) -> Parameter:
-    """The effect's parameter as identified; the library's range is widened where it must be."""
+    """Return the effect's parameter as identified; the library's range is widened where it must be."""
     # at a bound: uniform from neutral to twice as far
     sd = e.sd if math.isfinite(e.sd) else UNIFORM * 2 * abs(e.mean - q.neutral)
     low, high = min(p.low, e.mean - REACH * sd), max(p.high, e.mean + REACH * sd)
@@ -189,7 +189,7 @@ def _number(value: float | None) -> float:
 
 
 def apply(diagnosis: Found, physics: Physics) -> Physics:
-    """The corrected simulator: the same model and control step; nominal values are the identified ones.
+    """Return the corrected simulator: the same model and control step; nominal values are the identified ones.
 
     Args:
         physics: with the known parameters as its `model_space`; its effects are replaced by those found.
@@ -203,7 +203,7 @@ def apply(diagnosis: Found, physics: Physics) -> Physics:
 
 
 def prior(diagnosis: Found, physics: Physics | ParameterSpace | None = None) -> Distribution:
-    """What is known of the corrected simulator's theta: jointly Gaussian, truncated to the ranges.
+    """Return the distribution of the corrected simulator's theta: jointly Gaussian, truncated to the ranges.
 
     Where a diagnosis brings no covariance, the parameters are independent. Else the distribution's space has the names
     and ranges of the corrected simulator's, but uniform priors: over those a Gaussian is exact.
@@ -236,12 +236,12 @@ def _jointly(covariance: dict, space: ParameterSpace) -> Distribution:
 
 
 def _recorded(name: str, row: dict) -> Parameter:
-    """A known parameter by what diagnosis.json tells of it; it cannot be written into a model."""
+    """Return a known parameter by its record in diagnosis.json; it cannot be written into a model."""
     return Parameter(name, row["nominal"], row["low"], row["high"], unit=row.get("unit") or "")
 
 
 def correction(diagnosis: Found, space: ParameterSpace) -> storage.Correction:
-    """The effects found, and those parameters of `space` that were calibrated: the contents of effects.yaml."""
+    """Return the effects found, and those parameters of `space` that were calibrated: the contents of effects.yaml."""
     known = calibrated_of(diagnosis, space).parameters
     return storage.Correction(effects_of(diagnosis), tuple(p for p in known if p not in space.parameters))
 
@@ -283,7 +283,7 @@ def _friction_acting(spec: mujoco.MjSpec) -> mujoco.MjSpec:
 
 
 def _at_home(spec: mujoco.MjSpec, folder: str) -> mujoco.MjSpec:
-    """The specification with its meshes and textures where they are, wherever its XML will lie."""
+    """Return the specification with its meshes and textures where they are, wherever its XML will lie."""
     if folder:
         spec.meshdir = str((Path(folder) / spec.meshdir).resolve())
         spec.texturedir = str((Path(folder) / spec.texturedir).resolve())

@@ -62,11 +62,11 @@ class Findings:
         return self.selection.answer
 
     def having(self, part: Any) -> Findings:
-        """The findings with the result of one more stage."""
+        """Return the findings with the result of one more stage."""
         return replace(self, parts=MappingProxyType({**self.parts, type(part): part}))
 
     def part(self, kind: type[T]) -> T | None:
-        """The result of the stage whose part has this class; None if it did not run or found nothing."""
+        """Return the result of the stage whose part has this class; None if it did not run or found nothing."""
         return self.parts.get(kind)
 
 
@@ -74,16 +74,16 @@ class Observer:
     """What a diagnosis calls while it runs; every method does nothing unless a subclass overrides it."""
 
     def progress(self, text: str, done: int, total: int) -> None:
-        """Called when a part begins and while it goes on: what is being done, and how much of it is done."""
+        """Take the name of a part, when it begins and while it goes on, and how much of it is done."""
 
     def early(self, lines: Sequence[str]) -> None:
-        """Called with what the logs show before any simulation, in lines."""
+        """Take what the logs show before any simulation, in lines."""
 
     def known(self, setup: Setup, state: SearchState | None) -> None:
-        """Called before the search (None), and after each part of it with what was fitted so far."""
+        """Take what was fitted so far: before the search (None) and after each part of it."""
 
     def verdict(self, found: Findings) -> None:
-        """Called with the findings before the optional stages."""
+        """Take the findings before the optional stages."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def _together(stages: Sequence[Stage], found: Findings, observer: Observer) -> F
 
 
 def _joined(found: Findings, running: Iterable[Future[Findings]]) -> Findings:
-    """The findings with the parts and warnings of stages that began with `found`."""
+    """Return the findings with the parts and warnings of stages that began with `found`."""
     each = [future.result() for future in running]
     parts = {kind: part for after in each for kind, part in after.parts.items()}
     warnings = [text for after in each for text in after.warnings[len(found.warnings) :]]

@@ -33,7 +33,7 @@ class Gap:
     noise: float = 1.0
 
     def share(self, part: float) -> float:
-        """A part of E0 as a share of the squared gap above the noise, E0 - N; NaN where nothing is above it."""
+        """Return a part of E0 as a share of the squared gap above the noise, E0 - N; NaN where nothing is above it."""
         above = self.before - self.noise
         return part / above if above > 0.0 else math.nan
 
@@ -62,12 +62,12 @@ class Gap:
 
 
 def of_rms(before: float, after: float, noise: float = 1.0) -> Gap:
-    """The gap between two root mean square residuals, in noise standard deviations where nothing else is said."""
+    """Return the gap between two root mean square residuals, by default in noise standard deviations."""
     return Gap(before**2, after**2, noise**2)
 
 
 def of_one(squared: float, noise: float = 1.0) -> Gap:
-    """The gap that one model leaves."""
+    """Return the gap that one model leaves."""
     return Gap(squared, squared, noise)
 
 

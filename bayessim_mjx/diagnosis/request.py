@@ -90,7 +90,7 @@ class Tolerance:
         return [(i, n) for i, n in enumerate(self.names) if math.isfinite(self.noise[i])]
 
     def by_dof(self, channels: Array) -> Array:
-        """The positions among measured channels `[..., channels]` as `[..., nv]`; NaN where none was measured."""
+        """Return the positions among measured channels `[..., channels]` as `[..., nv]`; NaN where there is none."""
         seen = np.isfinite(self.noise)
         out = np.full((*channels.shape[:-1], len(seen)), np.nan)
         out[..., seen] = channels[..., : int(seen.sum())]
@@ -136,7 +136,7 @@ def _limit(part: str, text: str, kind: str, joint: str) -> Limit:
 
 
 def judge(model: mujoco.MjModel, motion: Array, noise: Array, given: dict[int, Limit]) -> Tolerance:
-    """The tolerance of every degree of freedom: as given, else the larger of NOISES sd and SHARE of the motion.
+    """Return the tolerance of every degree of freedom: as given, else the larger of NOISES sd and SHARE of the motion.
 
     Args:
         motion, noise: `[nv]`, range of motion and standard deviation of the noise, rad or m.

@@ -164,7 +164,7 @@ class Diagnosis:
         object.__setattr__(self, "verdict", Verdict(self.verdict))
 
     def to_dict(self) -> dict[str, Any]:
-        """The contents of diagnosis.json; numbers that are not finite become null."""
+        """Return the contents of diagnosis.json; numbers that are not finite become null."""
         out = {"schema": self.schema} | {
             f.name: plain(getattr(self, f.name))
             for f in dataclasses.fields(self)
@@ -173,11 +173,11 @@ class Diagnosis:
         return out
 
     def apply(self, physics: Physics) -> Physics:
-        """The corrected simulator, see `correction.apply`."""
+        """Return the corrected simulator, see `correction.apply`."""
         return correction.apply(self, physics)
 
     def prior(self, physics: Physics | ParameterSpace | None = None) -> Distribution:
-        """What is known of the corrected simulator's theta, for the loop; see `correction.prior`."""
+        """Return the distribution of the corrected simulator's theta, for the loop; see `correction.prior`."""
         return correction.prior(self, physics)
 
     def save(self, folder: str | Path) -> Path:
@@ -191,7 +191,7 @@ class Diagnosis:
 
 
 def load(folder: str | Path) -> Diagnosis:
-    """A saved diagnosis; what was not finite is NaN again."""
+    """Return a saved diagnosis; what was not finite is NaN again."""
     folder = Path(folder)
     raw: dict[str, Any] = json.loads((folder / "diagnosis.json").read_text())
     details = folder / "details.json"

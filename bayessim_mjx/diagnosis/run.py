@@ -62,7 +62,7 @@ def none_of_these(found: Findings, say: Progress) -> Findings:
 
 
 def _flexible(found: Findings, model: Model, missing: Disturbance | None = None) -> Flexible | None:
-    """A flexible force on top of a model; None if the model leaves no more than noise."""
+    """Return a flexible force on top of a model; None if the model leaves no more than noise."""
     if not found.selection.state.above_noise(model):
         return None
     with warnings.catch_warnings():
@@ -108,7 +108,7 @@ def investigate(
     observer: Observer = Observer(),  # noqa: B008  # has no state
     stages: Sequence[Stage] | None = None,
 ) -> Findings:
-    """The whole computation, before its results are put into words or written.
+    """Compute everything, before results are put into words or written.
 
     Args:
         robot: the model with the parameters that it may recalibrate.
@@ -193,7 +193,7 @@ def diagnose(
 
 
 def remembering(setup: Setup, folder: Path | None) -> Setup:
-    """The setup with a fitter that stores its fits in a folder, and finds there those of an interrupted search."""
+    """Return the setup with a fitter that stores its fits in a folder, and finds those of an interrupted search."""
     if folder is None:
         return setup
     return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, *_asked(setup))))
@@ -229,7 +229,7 @@ def _header(robot: Robot, model: Source, logs: Any, recorded: Sequence[Log]) -> 
 
 @contextmanager
 def noting() -> Iterator[list[str]]:
-    """A list that holds the warnings of its block, each once, when the block ends."""
+    """Return a list that holds the warnings of its block, each once, when the block ends."""
     notes: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)

@@ -119,7 +119,7 @@ class _Timed:
     warnings: tuple[str, ...]
 
     def cut(self, physics: Physics, quick: bool) -> Windows:
-        """The windows that models are fitted to."""
+        """Return the windows that models are fitted to."""
         steps = self.step.errors.cut.steps if self.step.errors else self.cuts(1).steps
         most = most_windows(physics, steps, quick)
         return self.step.noisier(self.cuts(self.step.factor, limit=most, centred=False, late=self.gate.timing.moved))
@@ -182,7 +182,7 @@ def prepare(
 
 
 def _checked(robot: Robot, logs: Sequence[Log], request: Request, looked: Callable[[Look], None]) -> _Checked:
-    """The logs after the gate, cut where they begin to be usable, and their notes."""
+    """Return the logs after the gate, cut where they begin to be usable, and their notes."""
     dt, said = control_period(robot, logs), [*request.notes]
     found, look = inverse_dynamics_check.checked(logs, robot, dt, said, looked)
     seconds = at_most(robot.mj_model.nv, request.quick) * (CUTTING.window + AROUND)  # that all windows hold together
@@ -218,7 +218,7 @@ def _measured(
     first: int = 1,
     cheaper: Errors | None = None,
 ) -> tuple[Callable[..., Windows], discretisation.Discretisation]:
-    """The windows, and what the time step is worth in them; shorter ones where contacts make longer ones a lottery.
+    """Return the windows and the error of the time step in them; shorter ones where contacts make it large.
 
     Args:
         limit: `[nv]`, the tolerance: steps are made finer than the budget allows until they are worth less; None: they

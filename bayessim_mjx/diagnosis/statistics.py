@@ -49,7 +49,7 @@ def covariance(replicates: Array) -> Array:
 
 
 def error(replicates: Array) -> Array:
-    """Standard errors `[...]` from replicates `[G, ...]`, each without one condition."""
+    """Return standard errors `[...]` from replicates `[G, ...]`, each without one condition."""
     g = len(replicates)
     return np.asarray(np.sqrt((g - 1) / g * np.sum((replicates - replicates.mean(0)) ** 2, axis=0)))
 
@@ -68,7 +68,7 @@ def interval(value: float, replicates: Array) -> tuple[float, float]:
 
 
 def mixture_quantiles(weight: Array, mean: Array, sd: Array, ends: Sequence[float]) -> Array:
-    """`[ends, k]`, of mixtures of Gaussians, by bisection of their distribution functions.
+    """Return `[ends, k]`, of mixtures of Gaussians, by bisection of their distribution functions.
 
     Args:
         weight: `[m]`, adding up to 1; mean, sd: `[m, k]`; ends: probabilities below.

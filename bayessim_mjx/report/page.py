@@ -27,7 +27,7 @@ def write(diagnosis: Diagnosis, folder: str | Path, missed: Any = None) -> Path:
 
 
 def render(d: Diagnosis, missed: Any = None, link: str = "", folder: Path = Path()) -> str:
-    """The page as text; `link`: to the page of the blind check, from where this one lies; `folder`: of the result."""
+    """Return the page as text; `link`: to the page of the blind check, from this one; `folder`: of the result."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
 

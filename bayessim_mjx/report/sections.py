@@ -40,7 +40,7 @@ TILES = {
 
 
 def top(d: Diagnosis, folder: Path) -> dict[str, Any]:
-    """The first screen: verdict, effects with places and numbers, three gaps, a command, warnings."""
+    """Return the first screen: verdict, effects with places and numbers, three gaps, a command, warnings."""
     verdict, stages = verdict_of(d), stages_of(d)
     shown = [s for s in TILES if s in stages_told(d) and finite(stages[s])]
     return {
@@ -57,7 +57,7 @@ def top(d: Diagnosis, folder: Path) -> dict[str, Any]:
 
 
 def _tile(d: Diagnosis, stage: str) -> dict[str, str]:
-    """A stage's gap: of one joint in its unit, of several as a share of the motion; noise sd below."""
+    """Return a stage's gap: of one joint in its unit, of several as a share of the motion; noise sd below."""
     level = getattr(d.gap, stage)
     noises = f"{noise_sd(level)} noise sd" + ", within the noise" * of_one(level**2).at_noise
     rows = [r for r in d.gap.physical.values() if finite(r.get(stage))]
@@ -71,7 +71,7 @@ def _tile(d: Diagnosis, stage: str) -> dict[str, str]:
 
 
 def about(d: Diagnosis) -> list[str]:
-    """What was diagnosed, from what, and when: short phrases."""
+    """Return robot, logs and date in short phrases."""
     a = d.about
     data = [str(p) for p in a.get("data") or []]
     where_ = f" in {', '.join(data[:3])}" + (f" and {len(data) - 3} more" if len(data) > 3 else "") if data else ""
@@ -206,7 +206,7 @@ def _effect(e: FoundEffect) -> dict[str, Any]:
 
 
 def candidates(d: Diagnosis) -> dict[str, Any]:
-    """The best of the ranking, scores with one and two standard errors on a scale that all rows share."""
+    """Return the best of the ranking, scores with one and two standard errors on a scale that all rows share."""
     shown = d.candidates[:MOST_CANDIDATES]
     reach = [c["score"] + k * (c.get("se") or 0.0) for c in shown if finite(c.get("score")) for k in (-2, 2)]
     limits = marks.scale_of(reach, zero=True)
@@ -234,7 +234,7 @@ def candidates(d: Diagnosis) -> dict[str, Any]:
 
 
 def _own(candidate: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of the candidate's own parameters: `<where>.<effect>.<parameter>`, or those without a place."""
+    """Return the values of the candidate's own parameters: `<where>.<effect>.<parameter>`, or those without a place."""
     labels = [str(x).partition("@") for x in candidate.get("effects") or []]
     heads = tuple(f"{where}.{name}." for name, _, where in labels)
     values = candidate.get("parameters") or {}
@@ -277,7 +277,7 @@ def where(d: Diagnosis) -> dict[str, Any]:
 
 
 def _link(x: Mapping[str, Any]) -> dict[str, Any]:
-    """A link of the chain; its verdict without the name and the numbers that stand beside it."""
+    """Return a link of the chain; its verdict without the name and the numbers that stand beside it."""
     head, _, rest = (words := str(x.get("verdict") or "")).partition(": ")
     words = (rest if "->" in head and rest else words).rpartition(" (corr ")[0] or (rest if "->" in head else words)
     return {

@@ -88,14 +88,14 @@ def _effects(d: Diagnosis) -> Table:
 
 
 def _rivals(e: FoundEffect) -> str:
-    """The effect's relative score and then its rivals with theirs, where they have one; nothing where there is none."""
+    """Return the effect's relative score, then its rivals with theirs, where they have one; "" without rivals."""
     shares = [percent(e.weight_among_rivals)] if finite(e.weight_among_rivals) else []
     rivals = [(candidate_title(r), r.get("weight")) for r in e.equivalent_to]
     return "; ".join([*shares, *(f"{name} {percent(weight)}" if finite(weight) else name for name, weight in rivals)])
 
 
 def _parameters(d: Diagnosis) -> Table:
-    """What the simulator's own parameters become, where that is the whole answer."""
+    """Tabulate the simulator's own parameters, where they are the whole answer."""
     rows = [
         [name, number(p.get("nominal")), estimate(p.get("mean"), p.get("sd"), p.get("unit") or "")]
         for name, p in d.parameters.items()

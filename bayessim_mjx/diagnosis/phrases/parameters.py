@@ -42,7 +42,7 @@ def less_accurate(found: Mapping[str, tuple[float, float, float]]) -> str:
 
 
 def remarks(known: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """A sentence for each suspect parameter, but one for all at a bound and one for all far off."""
+    """Return a sentence for each suspect parameter, but one for all at a bound and one for all far off."""
     bound = {name: p for name, p in known.items() if p.get("at_bound")}
     far = {name: p for name, p in known.items() if p.get("data_sheet")}
     texts = [f"{name} {p['structural']}." for name, p in known.items() if p["structural"] and name not in bound]

@@ -116,7 +116,7 @@ def _signature(found: Fingerprint) -> str:
 
 
 def signed(value: float, low: float, high: float, unit: str, phrase: str) -> str:
-    """A number with its interval and phrase; its sign in words where the phrase has a place for it."""
+    """Return a number with its interval and phrase; its sign in words where the phrase has a place for it."""
     for pair in OPPOSITES:
         if pair in phrase:
             positive = value > 0
@@ -162,7 +162,7 @@ def _shared(found: Sequence[Heard]) -> list[str]:
 
 
 def flexible_of(found: Flexible, on: str) -> dict[str, Any]:
-    """The numbers behind the sentences on a flexible force, for JSON.
+    """Return the numbers behind the sentences on a flexible force, for JSON.
 
     Args:
         on: the model that it is added to, `effects` or `recalibrated`.
@@ -188,7 +188,7 @@ def predicts(found: Mapping[str, Any]) -> bool:
 
 
 def flexible(found: Mapping[str, Any], one_log: bool = False) -> list[str]:
-    """The part of a model's residual that a flexible force removes, its place and its inputs; `flexible_of`."""
+    """Say which part of a model's residual a flexible force removes, its place and its inputs; `flexible_of`."""
     names = ("by part of the log" if one_log else "by condition", "in time")
     held = dict(zip(names, (found["held"]["condition"], found["held"]["interpolation"]), strict=True))
     of = "with the effects" if found["on"] == "effects" else "of the recalibrated simulator"
@@ -206,7 +206,7 @@ def flexible(found: Mapping[str, Any], one_log: bool = False) -> list[str]:
 
 
 def black_boxes(found: BlackBoxes | None, one_log: bool = False) -> list[str]:
-    """The shares that black boxes close of the gap beside the named effects; nothing where they were not tried."""
+    """Say which shares black boxes close of the gap beside the named effects; nothing where they were not tried."""
     if found is None:
         return []
     shares = [f"a small network without physics closes {_closes(found.network)} of the squared gap"]

@@ -67,7 +67,7 @@ COASTS_CLOSED = " The effects close {closed} of the squared gap of such joints."
 
 
 def sentences(d: Diagnosis) -> list[str]:
-    """The verdict, most important first; each number is one of the result's."""
+    """Return the verdict, most important first; each number is one of the result's."""
     far, basis = d.gap, d.basis
     texts = [_head(d), *_how_far(d), *_doubts(d), coasting(far, bool(d.effects)), _probable(d)]
     ambiguous = [found for found in d.answers if len(found["members"]) > 1]
@@ -90,7 +90,7 @@ def sentences(d: Diagnosis) -> list[str]:
 
 
 def _head(d: Diagnosis) -> str:
-    """The first sentence: the verdict with the place and the numbers of each effect."""
+    """Return the first sentence: the verdict with the place and the numbers of each effect."""
     far, fill = d.gap, _fill(d)
     if not d.effects or d.verdict not in ("effects", "ambiguous", "unexplained"):
         quoted = {"no_gap": far.nominal, "parameters": far.calibrated}.get(d.verdict)
@@ -130,7 +130,7 @@ def _fill(d: Diagnosis) -> dict[str, str]:
 
 
 def _how_far(d: Diagnosis) -> list[str]:
-    """The gap before and after, the shares closed, and the joints against their tolerances."""
+    """Return the gap before and after, the shares closed, and the joints against their tolerances."""
     far, basis, out = d.gap, d.basis, []
     left = of_rms(far.calibrated, far.with_effects).left
     if d.effects:
@@ -173,7 +173,7 @@ def _noise(d: Diagnosis) -> list[str]:
 
 
 def _probable(d: Diagnosis) -> str:
-    """The probability of the named effects, where they are the explanation."""
+    """Return the probability of the named effects, where they are the explanation."""
     chance = d.basis.get("probability")
     if not chance or (d.verdict == "unexplained" and not d.gap.beyond):
         return ""
@@ -218,7 +218,7 @@ def stage(far: Gap, name: str) -> str:
 
 
 def gap_line(far: Gap, effects: bool) -> str:
-    """The three gap numbers on one line of the terminal (the page has tiles, `report.sections`)."""
+    """Return the three gap numbers on one line of the terminal (the page has tiles, `report.sections`)."""
     words = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
     known = [s for s in words if finite(getattr(far, s)) and (effects or s != "with_effects")]
     return "Gap: " + ", ".join(f"{stage(far, s)} {words[s]}" for s in known) + "." if known else ""
@@ -242,7 +242,7 @@ def _left(name: str, row: Mapping[str, Any]) -> str:
 
 
 def _within(far: Gap) -> str:
-    """The joint that is closest to its tolerance."""
+    """Return the joint that is closest to its tolerance."""
     name = next((n for n in _worst(far) if far.physical[n].get("tolerance")), "")
     if not name:
         return ""

@@ -238,7 +238,7 @@ class AtFinerSteps:
         return np.outer(off, off)
 
     def notes(self, model: Model, together: Array) -> list[str]:
-        """Notes for the warnings; together: `[k, k]`, covariance without it."""
+        """Make the notes for the warnings; together: `[k, k]`, covariance without it."""
         own = {c.name for effect in model.effects for c in effect.coordinates}
         each = zip(model.fit.coordinates, model.fit.values, self.shift, np.sqrt(np.diag(together)), strict=True)
         return notes.finer_steps((c.name, v, shift, c.unit, sd) for c, v, shift, sd in each if c.name in own)
@@ -266,7 +266,7 @@ def _shift(found: Findings) -> Array | None:
 
 
 def _finer(found: Findings) -> Simulator:
-    """The windows at finer steps, with the named effects only: a small program."""
+    """Return the windows at finer steps, with the named effects only: a small program."""
     setup, named = found.setup, {e.effect for e in found.model.effects}
     cut, step = setup.fitter.simulator.windows, float(setup.robot.mj_model.opt.timestep)
     effects = [e for e in setup.physics.effects if e.name in named]

@@ -33,7 +33,7 @@ PACKAGES = ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")  # what the 
 
 
 def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: str = "") -> Diagnosis:
-    """The result of what was found: numbers first, and then the sentences that are made of them.
+    """Make the result of the findings: numbers first, and then the sentences that are made of them.
 
     Args:
         about: what was diagnosed, see `Diagnosis`; file: name of the proposal's command file, where there is one.
@@ -85,7 +85,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
 
 
 def basis(found: Findings, verdict: Verdict) -> dict[str, Any]:
-    """The numbers behind the sentences that stand nowhere else in the result, see `Diagnosis.basis`."""
+    """Return the numbers behind the sentences that stand nowhere else in the result, see `Diagnosis.basis`."""
     state, cut, weighed = found.selection.state, found.setup.fitter.simulator.windows, found.selection.weighed
     window = cut.steps * cut.dt
     top, rivals = found.flexible_winner, sum(weighed.weight[k] for k in weighed.beside)
@@ -107,7 +107,7 @@ def basis(found: Findings, verdict: Verdict) -> dict[str, Any]:
 
 
 def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
-    """The covariance without what it says of parameters that end at a bound."""
+    """Return the covariance without its entries for parameters that end at a bound."""
     model, physics = found.model, found.setup.physics
     at = []
     for effect in model.effects:
@@ -160,7 +160,7 @@ def _where(found: Findings) -> list[Place]:
 
 
 def insufficient(reason: str, notes: Sequence[str], about: Mapping[str, Any] | None = None) -> Diagnosis:
-    """The verdict where nothing can be held out."""
+    """Return the verdict where nothing can be held out."""
     nothing = Gap(1.0, *(float("nan"),) * 4)
     said = [f"Too little data: {reason}."]
     return Diagnosis(
@@ -250,7 +250,7 @@ def _closure(effects: list[FoundEffect], closed: dict[str, Any]) -> list[dict[st
 
 
 def _flexible(found: Findings) -> dict[str, Any]:
-    """The flexible force on the recalibrated simulator and on top of the effects, in noise standard deviations."""
+    """Return the flexible force on the recalibrated simulator and beside the effects, in noise standard deviations."""
     base = found.flexible_base
     winner = found.flexible_winner if found.model.effects else None
     shown, on = winner or base, "effects" if winner else "recalibrated"

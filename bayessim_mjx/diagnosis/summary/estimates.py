@@ -191,7 +191,7 @@ def _weights(found: Findings, models: list[Model]) -> list[float]:
 
 
 def _unit(setup: Setup, effect: Candidate, unit: str) -> str:
-    """A hinge's unit as a slide's, where the place is a slide."""
+    """Return a hinge's unit as a slide's, where the place is a slide."""
     model = setup.physics.mj_model
     if effect.kind not in ("joint", "actuator") or effect.where == "all":
         return unit
@@ -224,7 +224,7 @@ def parameters(selection: Selection, model: Model, sd: Array, mean: Array) -> di
 
 
 def _against_data_sheet(c: Coordinate, value: float, precision: float) -> dict[str, Any]:
-    """The distance of a known parameter from its stated value, in words and in sd, if it is larger than `CLEAR`."""
+    """Return the distance of a known parameter from its stated value, in words and in sd, if larger than `CLEAR`."""
     away = abs(value - c.neutral) * precision**0.5
     if not (c.stated and away > CLEAR):
         return {"data_sheet": ""}
@@ -242,7 +242,7 @@ def accuracy(model: Model, sheet: Posterior) -> dict[str, dict[str, float]]:
 
 
 def less_accurate(model: Model, sheet: Posterior) -> list[str]:
-    """A remark on kinds of parameters that are farther from their data sheet than usual, with 95 % probability."""
+    """Remark on kinds of parameters that are farther from their data sheet than usual, with 95 % probability."""
     every = accuracy(model, sheet).items()
     found = {k: (own["median"], own["low"], own["high"]) for k, own in every if own["low"] > data_sheet.ACCURACY}
     return [remarks.less_accurate(found)] if found else []

@@ -76,7 +76,7 @@ class Files(Observer):
             journal.remove(self.folder / SEARCH)
 
     def result(self, found: Findings) -> Diagnosis:
-        """The findings as a Diagnosis; writes the proposed experiment as a file that can be played."""
+        """Make a Diagnosis of the findings; write the proposed experiment as a file that can be played."""
         proposal, name = found.part(Experiment), ""
         if self.folder is not None and proposal is not None and proposal.chosen is not None:
             source = str(self.folder / "diagnosis.json")

@@ -61,7 +61,7 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
 
 
 def with_whole(far: Gap, over: Whole, allowed: Tolerance) -> Gap:
-    """The gap with one more horizon: whole logs, where some can be predicted."""
+    """Return the gap with one more horizon: whole logs, where some can be predicted."""
     if not len(over.group):
         return far
     row = heldout.stages(over.cost, over.group)
@@ -102,7 +102,7 @@ def _remains(last: Prediction, allowed: Tolerance) -> dict[str, dict[str, Any]]:
 
 
 def _floor(again: Any, steps: int, row: dict[str, Any]) -> dict[str, Any]:
-    """What no model can undercut: what repeats of the same commands differ by; the noise where there are none."""
+    """Return the floor of every model: the difference of repeated commands; the noise where there are none."""
     if again is None:
         return _level(1.0, (1.0, 1.0), row, "noise")
     prediction, group = again
@@ -111,7 +111,7 @@ def _floor(again: Any, steps: int, row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _level(level: float, ci: tuple[float, float], row: dict[str, Any], source: str) -> dict[str, Any]:
-    """The floor of one horizon, between the noise and what the last stage reaches; adds its interval to the row's."""
+    """Return the floor of one horizon, between noise and last stage; its interval is added to the row's."""
     low, high = (max(v, 1.0) for v in ci)
     level = min(max(level, 1.0), row["with_effects"])
     row["ci"]["reducible_floor"] = [min(low, level), max(level, min(high, row["ci"]["with_effects"][1]))]
@@ -119,7 +119,7 @@ def _level(level: float, ci: tuple[float, float], row: dict[str, Any], source: s
 
 
 def repeats(fitter: Fitter, fit: Fit, logs: Sequence[Log]) -> tuple[Prediction, NDArray[np.int64]] | None:
-    """The error of a perfect model of what repeats, window by window, and the windows' conditions `[P]`.
+    """Return the error of a perfect model of what repeats, window by window, and the windows' conditions `[P]`.
 
     Two runs of the same commands differ by twice the variance of what is not reproducible. What comes of their
     different start states is taken out as it is from a model's errors, by the fit's derivatives.

@@ -66,7 +66,7 @@ class Verdict:
 
 
 def verdict_of(found: Findings, far: Gap) -> Verdict:
-    """The verdict on what was found; `far`: what remains of the gap."""
+    """Return the verdict on what was found; `far`: what remains of the gap."""
     force, (limit, gap) = found.selection.force, relevant(found, far)
     chance = force.chance(limit)
     probable = chance > ODDS.strong / (1.0 + ODDS.strong)
@@ -93,7 +93,7 @@ def relevant(found: Findings, far: Gap) -> tuple[float, float]:
 
 
 def force_in_numbers(found: Findings, far: Gap) -> dict[str, Any]:
-    """The missing force for JSON: by joint its rms in N m or N, its evidence, its share of the gap, its relevance."""
+    """Return the missing force for JSON: by joint its rms in N m or N; evidence, share of the gap, relevance."""
     force, (limit, gap) = found.selection.force, relevant(found, far)
     names = Channels.of(found.setup.physics.mj_model).qvel
     rows = zip(names, force.amplitude, force.low, force.high, force.by_joint, strict=True)
@@ -135,7 +135,7 @@ def builds_up(found: Findings, far: Gap) -> float:
 
 
 def _explained(found: Findings, noise: Origin | None) -> str:
-    """The verdict where no relevant force is missing."""
+    """Return the verdict where no relevant force is missing."""
     state, model = found.selection.state, found.model
     if model.effects:
         return "ambiguous" if found.selection.ambiguous else "effects"
