@@ -20,6 +20,7 @@ HEADS = {
 }
 SMALL = " This exceeds the noise, but is too small to identify a cause."  # where the residual is above the noise
 PARTLY_HEAD = "Partly explained: {named}."
+PART = "The library explains only a part of the gap that recalibration leaves, {calibrated}."
 REST = "More than the tolerance remains at {beyond}."
 IMPERFECT = "No candidate closes the rest, {rest} of the squared gap: the law is not quite that of the real system."
 NEAREST = "Nearest effects of the library: {nearest}."
@@ -43,7 +44,7 @@ PROBABLE = (
     "Probability among all fitted explanations: {own} for this one, {others}, {nothing} for the known parameters alone."
 )
 PAST = "The missing force depends on something else, such as the past of the motion."
-SPLITS = "To separate them, run the next experiment: {name}."
+SPLITS = "To separate the explanations, run the next experiment: {name}."
 HIDDEN = "Beside {them} these logs would not show {hidden}: {their} numbers change the motion alike."
 BUILDS_UP = (
     "Over whole logs the error is {times} times as large as noise, start and parameters explain. Within {window} it "
@@ -98,9 +99,9 @@ def _head(d: Diagnosis) -> str:
         head = HEADS["no_gap"].partition(": ")[2] if above and d.verdict == "no_gap" else HEADS[d.verdict]
         return named.capital((head + SMALL * above).format(**fill))
     if d.verdict == "unexplained":
-        return (f"{PARTLY_HEAD} {REST}" if far.beyond else HEADS["unexplained"]).format(
-            named=named.lacking(d.effects), **fill
-        )
+        gap = of_rms(far.calibrated, far.with_effects)
+        head = f"{PARTLY_HEAD} {REST}" if far.beyond else PART if gap.closed > gap.left else HEADS["unexplained"]
+        return head.format(named=named.lacking(d.effects), **fill)
     several = {a["effect"]: a for a in d.answers if len(a["members"]) > 1}
     open_ = [named.answer(e, several[label]) for e in d.effects if (label := f"{e.name}@{e.where}") in several]
     sure = [e for e in d.effects if f"{e.name}@{e.where}" not in several]

@@ -17,7 +17,7 @@ from bayessim_mjx.diagnosis.phrases import first_look, residual
 from bayessim_mjx.diagnosis.phrases.verdict import horizon_warning, sentences
 from bayessim_mjx.diagnosis.request import length_unit
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
-from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap, Place
+from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
 from bayessim_mjx.diagnosis.selection import bounds
 from bayessim_mjx.diagnosis.selection.budget import SINGLES
 from bayessim_mjx.diagnosis.selection.models import BASE, systematic
@@ -69,7 +69,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         warnings=[*notes, *estimates.less_accurate(model, own.sheet), *found.warnings],
         next_experiment=experiment,
         versions=versions.of(PACKAGES),
-        details=details(found, effects, closed) | more,
+        details=details(found) | more,
         covariance={"names": list(model.fit.names), "matrix": together},
         not_fitted=not_fitted(selection.state),
         about={**about, "conditions": setup.fitter.simulator.windows.conditions} if about else {},
@@ -163,19 +163,8 @@ def insufficient(reason: str, notes: Sequence[str], about: Mapping[str, Any] | N
     """Return the verdict where nothing can be held out."""
     nothing = Gap(1.0, *(float("nan"),) * 4)
     said = [f"Too little data: {reason}."]
-    return Diagnosis(
-        "insufficient_data",
-        said,
-        [],
-        [],
-        nothing,
-        {},
-        [],
-        list(notes),
-        {},
-        versions.of(PACKAGES),
-        about=dict(about or {}),
-    )
+    about, own = dict(about or {}), versions.of(PACKAGES)
+    return Diagnosis("insufficient_data", said, [], [], nothing, {}, [], list(notes), {}, own, about=about)
 
 
 def not_fitted(state: SearchState) -> dict[str, list[str]]:
@@ -206,7 +195,8 @@ def _reason(state: SearchState, label: str, gains: dict[str, float]) -> str:
     return phrases.LESS_PROMISING if state.above_noise(state.base) else phrases.NOTHING_LEFT
 
 
-def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any]) -> dict[str, Any]:
+def details(found: Findings) -> dict[str, Any]:
+    """Return the numbers of the pictures, see `report`."""
     model, cut = found.model, found.setup.fitter.simulator.windows
     each, deviation = estimates.per_condition(found.setup.fitter, model)
     names = model.fit.names
@@ -215,8 +205,6 @@ def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any])
         "overlays": _overlays(found),
         "isolability": _isolability(found.selection.state),
         "episodes": _episodes(found),
-        "closure": _closure(effects, closed),
-        "shapley": [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in effects if e.share == e.share],
         "flexible": _flexible(found),
         "black_boxes": _black_boxes(found.part(BlackBoxes)),
         "groups": {
@@ -236,17 +224,6 @@ def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any])
             for n, s in zip(Channels.of(found.setup.physics.mj_model).qvel, cut.sigma_q, strict=True)
         ],
     }  # fmt: skip
-
-
-def _closure(effects: list[FoundEffect], closed: dict[str, Any]) -> list[dict[str, Any]]:
-    """Promised and realised, of each effect and of all together."""
-    labels = [f"{e.name}@{e.where}" for e in effects]
-    rows: list[dict[str, Any]] = [
-        {"effects": [n], "predicted": e.predicted_gap_closed, "realised": e.gap_closed, "ci": e.gap_closed_ci}
-        for n, e in zip(labels, effects, strict=True)
-    ]
-    both = {k: closed[k] for k in ("predicted", "realised", "ci")} if len(rows) > 1 else {}
-    return [*rows, {"effects": labels} | both] if both else rows
 
 
 def _flexible(found: Findings) -> dict[str, Any]:
