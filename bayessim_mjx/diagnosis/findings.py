@@ -103,6 +103,20 @@ class Stage:
     patient: bool = False
     beside: bool = False
 
+    def after(self, found: Findings, say: Progress, time_left: Budget = Budget()) -> Findings:  # noqa: B008  # immutable
+        """Return the findings after this stage; without it and with a note where it failed or the time was over.
+
+        The verdict stands: a missing picture or proposal must not lose it.
+        """
+        if (self.patient or self.optional) and time_left.late:
+            return replace(found, warnings=(*found.warnings, notes.left_out(self.name)))
+        try:
+            return self.run(found, say)
+        except Exception as error:
+            if not self.optional:
+                raise
+            return replace(found, warnings=(*found.warnings, notes.left_out(self.name, error)))
+
 
 def carry_out(stages: Sequence[Stage], found: Findings, time_left: Budget, observer: Observer) -> Findings:
     """Run all stages; the observer gets the verdict once all stages that are not optional have run.
@@ -112,13 +126,15 @@ def carry_out(stages: Sequence[Stage], found: Findings, time_left: Budget, obser
     beside = [] if time_left.limited else [s for s in stages if s.beside]
     alone = [s for s in stages if s not in beside]
     for stage in (s for s in alone if not s.optional):
-        found = _in_time(stage, found, observer.progress, time_left)
+        observer.progress(stage.name, 0, 1)
+        found = stage.after(found, observer.progress, time_left)
     if beside:
         found = _together(beside, found, observer)
     else:
         observer.verdict(found)
     for stage in (s for s in alone if s.optional):
-        found = _in_time(stage, found, observer.progress, time_left)
+        observer.progress(stage.name, 0, 1)
+        found = stage.after(found, observer.progress, time_left)
     return found
 
 
@@ -128,7 +144,7 @@ def _together(stages: Sequence[Stage], found: Findings, observer: Observer) -> F
     done: list[Stage] = []
 
     def one(stage: Stage) -> Findings:
-        after = _after(stage, found, lambda text, done, total: None)
+        after = stage.after(found, lambda text, done, total: None)
         done.append(stage)
         observer.progress(name, len(done), len(stages))
         return after
@@ -148,20 +164,3 @@ def _joined(found: Findings, running: Iterable[Future[Findings]]) -> Findings:
     warnings = [text for after in each for text in after.warnings[len(found.warnings) :]]
     both = {**found.parts, **parts}
     return replace(found, parts=MappingProxyType(both), warnings=(*found.warnings, *warnings))
-
-
-def _in_time(stage: Stage, found: Findings, say: Progress, time_left: Budget) -> Findings:
-    if (stage.patient or stage.optional) and time_left.late:
-        return replace(found, warnings=(*found.warnings, notes.out_of_time(stage.name)))
-    say(stage.name, 0, 1)
-    return _after(stage, found, say)
-
-
-def _after(stage: Stage, found: Findings, say: Progress) -> Findings:
-    try:
-        return stage.run(found, say)
-    except Exception as error:
-        if not stage.optional:
-            raise
-        # the verdict stands: a missing picture or proposal must not lose it
-        return replace(found, warnings=(*found.warnings, notes.lost(stage.name, error)))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.data_sheet import assigned, measure
-from bayessim_mjx.diagnosis.gap import above_noise
 from bayessim_mjx.diagnosis.selection.search_state import Settings
+from bayessim_mjx.diagnosis.statistics import above_noise
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Channels
@@ -109,44 +110,41 @@ def length_unit(model: mujoco.MjModel, dof: int) -> str:
     return "m" if slides or (free and dof - int(model.jnt_dofadr[joint]) < 3) else "rad"
 
 
-def read(texts: Sequence[str], model: mujoco.MjModel) -> dict[int, Limit]:
-    """{degree of freedom: limit} of what was typed: `0.5deg`, `2%` for all joints, `elbow=0.5deg`, with commas too.
+def tolerances(texts: Sequence[str], model: mujoco.MjModel) -> Callable[[Array, Array], Tolerance]:
+    """Read what was typed, `0.5deg`, `2%` for all joints, `elbow=0.5deg`, with commas too: `judge` with these limits.
 
     A joint's own limit goes before that of all joints.
 
     Raises:
         UserError: an unknown joint, a missing unit or one that the joint has not, a number that is not above 0.
     """
-    channels = Channels.of(model)
-    out: dict[int, Limit] = {}
-    for part, name, value in assigned(texts):
+    channels, given = Channels.of(model), dict[int, Limit]()
+    kinds = [length_unit(model, v) for v in range(model.nv)]
+    judged = functools.partial(judge, model, given)
+    for part, name, text in assigned(texts):
         own = [v for v, n in enumerate(channels.qvel) if not name or n == name or n.startswith(f"{name}[")]
         if not own:
             raise UserError(f"--tolerance {part}: no joint {name!r}; {suggest(name, channels.joints)}")
         for dof in own:
-            out[dof] = _limit(part, value, length_unit(model, dof), channels.qvel[dof])
-    return out
+            units = UNITS[kinds[dof]] | RELATIVE
+            examples = listed([f"5{unit}" for unit in units], "or")
+            allowed = f"a number above 0 with a unit: {examples} of the range of motion"
+            has = f"{channels.qvel[dof]} is in {listed(list(units), 'or')}"
+            value, unit = measure(f"--tolerance {part}", text, units, allowed, has)
+            given[dof] = Limit(value, unit in RELATIVE)
+    return judged
 
 
-def _limit(part: str, text: str, kind: str, joint: str) -> Limit:
-    units = UNITS[kind] | RELATIVE
-    allowed = f"a number above 0 with a unit: {listed([f'5{unit}' for unit in units], 'or')} of the range of motion"
-    value, unit = measure(f"--tolerance {part}", text, units, allowed, f"{joint} is in {listed(list(units), 'or')}")
-    return Limit(value, unit in RELATIVE)
-
-
-def judge(model: mujoco.MjModel, motion: Array, noise: Array, given: dict[int, Limit]) -> Tolerance:
+def judge(model: mujoco.MjModel, given: Mapping[int, Limit], motion: Array, noise: Array) -> Tolerance:
     """Return the tolerance of every degree of freedom: as given, else the larger of NOISES sd and SHARE of the motion.
 
     Args:
+        given: {degree of freedom: limit}.
         motion, noise: `[nv]`, range of motion and standard deviation of the noise, rad or m.
-        given: {degree of freedom: limit}, see `read`.
     """
     limit = np.maximum(NOISES * noise, SHARE * motion)
     for dof, own in given.items():
         limit[dof] = own.value * motion[dof] if own.relative else own.value
     units = tuple(length_unit(model, v) for v in range(model.nv))
-    by_user = np.isin(np.arange(model.nv), list(given))
-    return Tolerance(
-        Channels.of(model).qvel, units, limit, np.asarray(motion, float), np.asarray(noise, float), by_user
-    )
+    user = np.isin(np.arange(model.nv), list(given))
+    return Tolerance(Channels.of(model).qvel, units, limit, np.asarray(motion, float), np.asarray(noise, float), user)

@@ -34,7 +34,7 @@ from bayessim_mjx.diagnosis.selection import budget, heldout
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup, prepare
-from bayessim_mjx.diagnosis.summary import again, assemble
+from bayessim_mjx.diagnosis.summary import again
 from bayessim_mjx.diagnosis.summary.files import Files
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Log
@@ -188,7 +188,7 @@ def diagnose(
     try:
         found = investigate(robot, recorded, request, files)
     except TooLittleData as reason:
-        return files.whole(assemble.insufficient(str(reason), request.notes, about), robot)
+        return files.insufficient(str(reason), request.notes, robot)
     return files.whole(files.result(found), robot)
 
 

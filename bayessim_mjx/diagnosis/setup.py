@@ -29,7 +29,7 @@ from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck import gate, noise
 from bayessim_mjx.diagnosis.phrases import notes
-from bayessim_mjx.diagnosis.request import Request, Tolerance, judge, read
+from bayessim_mjx.diagnosis.request import Request, Tolerance, tolerances
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.search_state import Settings
 from bayessim_mjx.effects.support.motion import AROUND
@@ -141,12 +141,12 @@ def prepare(
         UserError: unknown effects, no usable log, a tolerance that cannot be read.
         TooLittleData: too few windows.
     """
-    tolerated = read(request.tolerances, robot.mj_model)
+    tolerated = tolerances(request.tolerances, robot.mj_model)
     checked = _checked(robot, logs, request, looked)
     usable = checked.gate.usable
     size = scales.measure(checked.robot.mj_model, [resample(log, checked.dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(candidates.kinds_of(request.effects), size)
-    allows = functools.partial(judge, checked.robot.mj_model, 2 * size.travel, given=tolerated)
+    allows = functools.partial(tolerated, 2 * size.travel)
     timed = _timed(checked, size, allows(noise.noise_of_positions(usable)).limit, request.group, budget)
     physics = physics_of(timed.robot, checked.dt, stack)
     cut = timed.cut(physics, request.quick)
@@ -154,14 +154,8 @@ def prepare(
     led = inverse_dynamics_check.lead(candidates.enumerate_candidates(physics), checked.look)
     allowed = allows(cut.sigma_q)
     untried = [f"not tried: {text}" for text in left_out]
-    warnings = [
-        *checked.notes,
-        *timed.notes,
-        *timed.warnings,
-        *untried,
-        *cut.notes,
-        *notes.conditions(len(cut.groups), cut.blocks),
-    ]
+    few = [*notes.conditions(len(cut.groups), cut.blocks), *notes.below_noise(allowed)]
+    warnings = [*checked.notes, *timed.notes, *timed.warnings, *untried, *cut.notes, *noise.not_compared(usable), *few]
     own = Settings(screened=24) if robot.mj_model.nv > CUTTING.many else Settings()
     settings = request.settings or (QUICK if request.quick else own)
     return Setup(
@@ -174,7 +168,7 @@ def prepare(
         settings=dataclasses.replace(settings, believed=timed.step.believed, budget=budget),
         seed=request.seed,
         tolerance=allowed,
-        warnings=(*warnings, *noise.not_compared(usable), *notes.below_noise(allowed), *led.sentences()),
+        warnings=(*warnings, *led.sentences()),
         said=timed.notes,
         discretisation=timed.step,
         look=checked.look,
@@ -201,7 +195,11 @@ def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | No
     left = (budget.seconds - budget.spent) / CUTTING.simulations  # s for one simulation of all windows
     steps = integrator_choice.choose(checked.robot, dt, usable, measured, left)
     cuts, step = steps.cuts, steps.worth
-    shift = _shift(cuts, step, size)
+    shift, factor = None, min(step.factor, step.errors.finest) if step.errors else step.factor
+    if step.errors is not None and step.errors.physics.mj_model.nu:  # by how much commands act later than logged
+        shift = command_shift.estimate(
+            step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
+        )
     late = [] if shift is None else shift.notes(checked.period)
     clocked = checked.gate if shift is None else checked.gate.moved(shift.lead)
     period, timestep = float(np.median([log.period for log in usable])), float(checked.robot.mj_model.opt.timestep)
@@ -235,15 +233,3 @@ def _measured(
         if worth < CUTTING.lottery or not contacts(own) or cuts(1).steps <= CUTTING.shortest_window:
             break
     return cuts, step
-
-
-def _shift(
-    cuts: Callable[..., Windows], step: discretisation.Discretisation, size: scales.Scales
-) -> command_shift.Shift | None:
-    """By how much commands act later or earlier than the logs say."""
-    if step.errors is None or not step.errors.physics.mj_model.nu:
-        return None
-    factor = min(step.factor, step.errors.finest)
-    return command_shift.estimate(
-        step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
-    )

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from bayessim_mjx import quantities
-from bayessim_mjx.diagnosis.gap import of_rms
 from bayessim_mjx.diagnosis.phrases.effects import label_title, measured
 from bayessim_mjx.diagnosis.phrases.effects import quantity as _quantity
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate
+from bayessim_mjx.diagnosis.statistics import of_rms
 from bayessim_mjx.quantities import finite, typeset
 
 MISSING = quantities.MISSING  # where there is no number

@@ -39,7 +39,7 @@ DEG = math.pi / 180
     ],
 )
 def test_what_is_typed_and_what_is_taken_without(texts, hinge, rail):
-    own = request.judge(MODEL, np.array([2.0, 0.5]), np.array([0.001, 0.01]), request.read(texts, MODEL))
+    own = request.tolerances(texts, MODEL)(np.array([2.0, 0.5]), np.array([0.001, 0.01]))
     assert own.limit == pytest.approx([hinge, rail]) and own.units == ("rad", "m")
 
 
@@ -61,19 +61,19 @@ def test_what_is_typed_and_what_is_taken_without(texts, hinge, rail):
 )
 def test_what_cannot_be_read_is_refused_by_name(text, words):
     with pytest.raises(UserError, match=r"--tolerance") as told:
-        request.read([text], MODEL)
+        request.tolerances([text], MODEL)
     assert words in str(told.value) and ("allowed" in str(told.value) or "there are: hinge, rail" in str(told.value))
 
 
 def test_noise_is_taken_out_before_the_rest_is_judged():
-    own = request.judge(MODEL, np.array([1.0, 1.0]), np.array([0.01, 0.01]), {0: request.Limit(0.02, False)})
+    own = request.judge(MODEL, {0: request.Limit(0.02, False)}, np.array([1.0, 1.0]), np.array([0.01, 0.01]))
     # sqrt(0.022^2 - 0.01^2) = 0.0196; sqrt(0.0325^2 - 0.01^2) = 0.0309 > 3 noises
     assert own.exceeded(np.array([0.022, 0.0325])).tolist() == [False, True]
     assert own.exceeded(np.array([0.023, 0.0310])).tolist() == [True, False]
 
 
 def test_a_tolerance_below_the_noise_is_told():
-    own = request.judge(MODEL, np.ones(2), np.array([0.01, 0.01]), {0: request.Limit(0.001, False)})
+    own = request.judge(MODEL, {0: request.Limit(0.001, False)}, np.ones(2), np.array([0.01, 0.01]))
     (text,) = notes.below_noise(own)
     assert "hinge" in text and "noise" in text
     assert not own.exceeded(np.array([0.0141, 0.0])).any()  # what is left above the noise is the noise itself

@@ -11,13 +11,10 @@ from bayessim_mjx.quantities import EXACT, extent, finite, listed
 STAGES = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
 
 
-def out_of_time(stage: str) -> str:
-    """Name a stage that was left out."""
-    return f"{stage}: left out, the time was over"
-
-
-def lost(stage: str, error: Exception) -> str:
-    """Name a stage that failed."""
+def left_out(stage: str, error: Exception | None = None) -> str:
+    """Name a stage that failed with an error, or for which the time was over."""
+    if error is None:
+        return f"{stage}: left out, the time was over"
     return f"{stage}: not available ({type(error).__name__}: {error})"
 
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis.gap import Gap, of_one
 from bayessim_mjx.diagnosis.phrases.effects import MOST
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
 from bayessim_mjx.diagnosis.residual.frequency import Heard
 from bayessim_mjx.diagnosis.residual.where import LIMITS, Fingerprint, Located
 from bayessim_mjx.diagnosis.result import Place
+from bayessim_mjx.diagnosis.statistics import Gap, of_one
 from bayessim_mjx.quantities import count, listed, percent
 
 AXES = {

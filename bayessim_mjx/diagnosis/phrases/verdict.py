@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bayessim_mjx.diagnosis.gap import above_noise, of_one, of_rms
 from bayessim_mjx.diagnosis.phrases import effects as named
 from bayessim_mjx.diagnosis.phrases import parameters, residual
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
+from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
 from bayessim_mjx.quantities import extent, finite, listed, percent
 
 HEADS = {

@@ -28,10 +28,10 @@ from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.physics import Physics, staggered
 
 Array = NDArray[np.float64]
-# These three bound the seconds that whole logs take. Rules of thumb, not counted.
-LOGS = 8  # at most
-SECONDS = 10.0  # of each
-DRAWS = 8  # of the start, and as many of start and parameters
+# These three bound the seconds that whole logs take.
+LOGS = 8  # at most; a rule of thumb
+SECONDS = 10.0  # of each; a rule of thumb
+DRAWS = 8  # of the start, and as many of start and parameters; a rule of thumb
 # times as many steps as the fit took: a quarter of an error of first order is left, and extrapolated (Richardson 1911)
 FINER = 4
 

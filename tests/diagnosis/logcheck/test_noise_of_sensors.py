@@ -52,7 +52,7 @@ def test_fewer_than_three_values_in_every_log_tell_no_noise(arm, elbows):
     (text,) = noise.not_compared(logs)
     assert text.startswith("qpos:elbow: fewer than 3 values") and "quantum" in text
     assert not noise_free(logs, 1)  # or the time step's own error would be its noise
-    limit = request.judge(arm, np.array([2.0, 0.0]), noise.noise_of_positions(logs), {}).limit
+    limit = request.judge(arm, {}, np.array([2.0, 0.0]), noise.noise_of_positions(logs)).limit
     assert np.isfinite(limit[0]) and np.isinf(limit[1])  # no step is too coarse for it
 
 
