@@ -35,8 +35,8 @@ PROMISED = (
     "{realised} (floor: the noise of the residuals)."
 )
 ELSEWHERE = (
-    "Only chosen without it, {they} {close} {elsewhere}. Both shares may be a little too high: the fits that the "
-    "choice compares had seen every condition."
+    "If only the choice leaves it out, {they} {close} {elsewhere}. Both shares may be a little too high: the fits that "
+    "the choice compares had seen every condition."
 )
 IN_SAMPLE = "These numbers are in sample: one log is one operating condition, and other conditions may differ."
 WITHIN = "Every joint is within its tolerance (closest: {within})."
@@ -180,7 +180,7 @@ def _probable(d: Diagnosis) -> str:
         return ""
     own, others, nothing = (percent(chance[k]) for k in ("answer", "rivals", "nothing"))
     nothing = nothing if nothing.strip("0. %") else "less than one in a million"  # by the digits of `percent`
-    others = f"{others} for its rivals together" if chance["rivals"] else "none for rivals"
+    others = f"{others} for its rivals together" if chance["rivals"] else "which has no rival"
     return PROBABLE.format(own=own, others=others, nothing=nothing)
 
 
