@@ -53,7 +53,7 @@ def _parser() -> cli.PlainParser:
 
 
 def _known(group: Any) -> None:
-    """What is known of the robot, and what may stay unexplained."""
+    """Add the flags for known numbers of the robot, and for errors that may stay unexplained."""
     text = "YAML file with the parameters that may be recalibrated (default: damping, armature and mass)"
     group.add_argument("--parameters", metavar="FILE", help=text)
     text = (
@@ -71,7 +71,7 @@ def _known(group: Any) -> None:
 
 
 def _search(group: Any) -> None:
-    """What is searched, and how long that may take."""
+    """Add the flags for the search and its time."""
     text = (
         "effects to try, separated by commas: names, path.py:Class, or all that are on offer (default: all; "
         "docs/effects.md says which ones are tried only where named)"
@@ -84,7 +84,7 @@ def _search(group: Any) -> None:
 
 
 def _output(group: Any) -> None:
-    """What is written, and how much of it."""
+    """Add the flags for the files to write."""
     group.add_argument("--out", metavar="DIR", default="diagnosis", help="folder for the results")
     text = "the whole search, but no report, maps, black boxes or next experiment: diagnosis.json and effects.yaml"
     group.add_argument("--verdict_only", action="store_true", help=text)
@@ -112,7 +112,7 @@ def _of_task(name: str, parameters: str | Path | None) -> "Robot":
 
 
 def robot(source: "Source", parameters: str | Path | None = None) -> "Robot":
-    """The simulator under diagnosis: what `diagnose` takes as its model.
+    """Return the simulator under diagnosis: what `diagnose` takes as its model.
 
     Args:
         source: an MJCF (or URDF) file, the name of a task (also `file.py:Class`), a MuJoCo specification or model, or a
@@ -134,7 +134,7 @@ def _is_task(source: Any) -> bool:
 
 
 def _names(effects: str) -> str | list[str]:
-    """The effects of --effects, each of which there has to be."""
+    """Return the effects of --effects, each of which has to exist."""
     from bayessim_mjx.effects import load
 
     names = [n.strip() for n in effects.split(",") if n.strip()]
@@ -169,7 +169,7 @@ def _diagnose(argv: Sequence[str] | None) -> int:
     from bayessim_mjx import report
     from bayessim_mjx.diagnosis import run
     from bayessim_mjx.diagnosis.fitting.robot import of_file
-    from bayessim_mjx.diagnosis.verdicts import Verdict
+    from bayessim_mjx.diagnosis.result import Verdict
 
     began, effects = time.monotonic(), _names(args.effects)
 
@@ -195,7 +195,7 @@ def _diagnose(argv: Sequence[str] | None) -> int:
 
 
 def _told(title: str, lines: Sequence[str], headless: bool) -> None:
-    """A list that is told as soon as it is known: what the logs say before anything is simulated, for one."""
+    """Print a list as soon as it is known, such as what the logs show before anything is simulated."""
     from bayessim_mjx.monitor.output import Output
 
     out = Output(headless, sys.stdout)

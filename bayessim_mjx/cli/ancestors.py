@@ -73,12 +73,12 @@ INSTEAD = {
 
 
 def word(flag: str) -> str | None:
-    """What to say of a flag that another tool has; None where none has it."""
+    """Explain a flag that another tool has; None where none has it."""
     return INSTEAD.get("--" + flag.removeprefix("--").replace("-", "_"))
 
 
 def one_value(values: dict[str, str | None]) -> str | None:
-    """The value of a setting that several flags name, {flag: value}; UserError where they differ."""
+    """Return the value of a setting that several flags name, {flag: value}; UserError where they differ."""
     given = [(flag, value) for flag, value in values.items() if value is not None]
     for flag, value in given[1:]:
         if value != given[0][1]:

@@ -87,13 +87,13 @@ COMMANDS = {
 
 
 def name_of(written: str) -> str:
-    """The command's name as it is typed: `gap_loop`, a module's name and `gap-loop` are one."""
+    """Return the command's name as it is typed: `gap_loop`, a module's name and `gap-loop` are one."""
     modules = {command.module: name for name, command in COMMANDS.items() if command.module not in ("", "main")}
     return modules.get(written, written.replace("_", "-"))
 
 
 def module_of(name: str) -> str:
-    """The file of a command."""
+    """Return the file of a command."""
     return COMMANDS[name].module or name.replace("-", "_")
 
 
@@ -103,7 +103,7 @@ def prog_of(name: str) -> str:
 
 
 def examples_of(name: str) -> str:
-    """The examples of a command as a part of its help."""
+    """Return the examples of a command as a part of its help."""
     name = name_of(name)
     if name not in COMMANDS:  # a script's own parser
         return ""

@@ -12,7 +12,7 @@ FILES, FOLDERS = ("FILE", "PATH", "LOGS"), ("DIR", "RUN", "PATH|latest|best")  #
 
 
 def script(shell: str, commands: Mapping[str, tuple[str, argparse.ArgumentParser]]) -> str:
-    """The script for `shell`; `commands` are (what each is for, its parser) by the name that is typed.
+    """Return the script for `shell`; `commands` are (what each is for, its parser) by the name that is typed.
 
     Raises:
         UserError: shtab is not installed.

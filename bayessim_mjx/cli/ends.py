@@ -2,16 +2,20 @@
 
 import os
 import sys
+import traceback
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from bayessim_mjx.errors import UserError, out_of_memory, refused
 
 DEBUG_VARIABLE = "BAYESSIM_MJX_DEBUG"  # set: errors come with a traceback
 BUGS = "to the issue tracker of bayessim_mjx"
+OPENGL = "MUJOCO_GL"  # MuJoCo loads the OpenGL library of this name when it is imported
+LIBRARIES = "egl (Debian: libegl1), osmesa (libosmesa6), glfw (libglfw3, with a screen), or disable (no video)"
 
 
 def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:
-    """A `main(argv=None)` that returns an exit code.
+    """Return a `main(argv=None)` that returns an exit code.
 
     0; 2 and one line on stderr for what the user can mend; 1 and a traceback for a bug; 130 after Ctrl-C.
     """
@@ -31,9 +35,9 @@ def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:
         except Exception as error:
             if os.environ.get(DEBUG_VARIABLE):
                 raise
-            if not isinstance(error, UserError) and not refused(error):
+            if not isinstance(error, UserError) and not refused(error) and not no_opengl(error):
                 return _bug()
-            print(f"error: {one_line(error)}", file=sys.stderr)
+            print(f"error: {no_opengl(error) or one_line(error)}", file=sys.stderr)
             return 2
 
     main.__doc__ = run.__doc__
@@ -41,17 +45,24 @@ def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:
 
 
 def one_line(error: Exception) -> str:
-    """The message without line ends; where memory was short, with the settings to lower."""
+    """Return the message without line ends; where memory was short, with the settings to lower."""
     text = " ".join(str(error).split("\n"))
     if not out_of_memory(error):
         return text
     return f"{text.rstrip('. ') or 'out of memory'}; lower env.numEnvs, ppo.num_steps or bayessim.trainTrajs"
 
 
-def _bug() -> int:
-    """The traceback of the present error, and what to do with it."""
-    import traceback
+def no_opengl(error: BaseException) -> str:
+    """Return the message where MuJoCo cannot load the OpenGL library that MUJOCO_GL names; "" for any other error."""
+    chosen = os.environ.get(OPENGL, "")
+    files = (Path(frame.f_code.co_filename).parts for frame, _ in traceback.walk_tb(error.__traceback__))
+    if not chosen or not any(parts[-1] == "gl_context.py" and "mujoco" in parts for parts in files):
+        return ""
+    return f"{OPENGL}={chosen}: OpenGL cannot be loaded; allowed: {LIBRARIES}; install it or choose another"
 
+
+def _bug() -> int:
+    """Print the traceback of the present error, and where to report it."""
     traceback.print_exc()
     print(f"\nThis is a bug: please report it with the lines above and your command, {BUGS}", file=sys.stderr)
     return 1

@@ -15,7 +15,7 @@ from bayessim_mjx.errors import UserError
 
 
 def _writers(text: str) -> tuple[str, ...]:
-    """The writers beside TensorBoard that --logger names."""
+    """Return the writers beside TensorBoard that --logger names."""
     if text not in (allowed := ("tensorboard", *WRITERS)):
         raise argparse.ArgumentTypeError(f"{text[:60]!r}: allowed are {', '.join(allowed)}")
     return () if text == "tensorboard" else (text,)
@@ -69,7 +69,7 @@ RESUMABLE = (
 
 
 def default_of(key: str) -> str:
-    """The default of a setting as a help shows it; empty where there is none to show."""
+    """Return the default of a setting as a help shows it; empty where there is none to show."""
     section, _, name = key.rpartition(".")
     if section in ("env", "ppo"):
         return " (default: the task's)"

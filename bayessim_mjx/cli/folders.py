@@ -28,7 +28,7 @@ def writable(folder: str | Path, flag: str) -> None:
 
 
 def open_run(folder: str | Path, flag: str) -> "Run":
-    """The run in a folder.
+    """Return the run in a folder.
 
     Raises:
         UserError: naming the flag; there is no run, or it is damaged.

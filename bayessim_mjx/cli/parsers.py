@@ -16,7 +16,7 @@ GENERAL = "options"  # argparse's own heading of --help
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
-    """The type of a flag that takes a whole number from `low` to `high`, in the digits 0 to 9."""
+    """Return the type of a flag that takes a whole number from `low` to `high`, in the digits 0 to 9."""
 
     def number(text: str) -> int:
         if not re.fullmatch("[+-]?[0-9]{1,25}", text):
@@ -29,7 +29,7 @@ def whole(low: int, high: int) -> Callable[[str], int]:
 
 
 def positive(unit: str) -> Callable[[str], float]:
-    """The type of a flag that takes a number of `unit` (a plural), more than 0 and below 1e5."""
+    """Return the type of a flag that takes a number of `unit` (a plural), more than 0 and below 1e5."""
 
     def number(text: str) -> float:
         try:
@@ -47,7 +47,7 @@ integer = whole(-(10**25), 10**25)  # where the settings know the limits
 
 
 def task(text: str) -> str:
-    """The type of --task: the file of `slider.py:Slider` may run from now on, and is named by its full path."""
+    """Return the type of --task: the file of `slider.py:Slider` may run from now on, and is named by its full path."""
     if not is_file(text):
         return text
     path, _, title = text.rpartition(":")
@@ -87,7 +87,7 @@ class PlainParser(argparse.ArgumentParser):
         self.add_argument("--version", action=Version, nargs=0, help="print the version and stop")
 
     def group(self, heading: str) -> Any:
-        """The group of flags under a heading of the help, made when it is first asked for."""
+        """Return the group of flags under a heading of the help, made when it is first asked for."""
         known = {group.title: group for group in self._action_groups}
         return known.get(heading) or self.add_argument_group(heading)
 
@@ -107,18 +107,18 @@ class PlainParser(argparse.ArgumentParser):
         return found
 
     def _below(self) -> list[argparse.ArgumentParser]:
-        """The parsers of the parts of this command."""
+        """Return the parsers of the parts of this command."""
         parts = (a for a in self._actions if isinstance(a, argparse._SubParsersAction))
         return [parser for action in parts for parser in action.choices.values()]
 
     def unknown_flag(self, flag: str, known: Iterable[str]) -> UserError:
-        """The error for a flag that does not exist, with the close ones."""
+        """Return the error for a flag that does not exist, with the close ones."""
         close = nearest(flag, known, 2)
         hint = f" Did you mean {' or '.join(close)}?" if close else ""
         return UserError(f"flag {flag!r} is unknown.{hint} Allowed: the flags that {self.prog} --help lists")
 
     def refusal(self, error: UserError) -> UserError:
-        """The error with the command that lists what is allowed."""
+        """Return the error with the command that lists what is allowed."""
         return UserError(f"{error} ({self.prog} --help lists all)")
 
     def error(self, message: str) -> NoReturn:

@@ -44,7 +44,7 @@ def pin_policy(config: Config) -> Config:
 
 
 def physics_settings(args: argparse.Namespace) -> dict[str, tuple[str, Any]]:
-    """Settings behind `--randomize` and `--domain`; those of a run that is its domain hold where no others are given.
+    """Return the settings of `--randomize` and `--domain`; those of a run that is its domain hold without others.
 
     Raises:
         UserError: both flags; a domain that is neither nominal or prior nor a folder or file there is.
@@ -72,7 +72,7 @@ def physics_settings(args: argparse.Namespace) -> dict[str, tuple[str, Any]]:
 
 
 def load_policy(path: Path, env: Any, config: Config) -> Any:
-    """The policy in a checkpoint folder; its networks have to be those of `config`."""
+    """Return the policy in a checkpoint folder; its networks have to be those of `config`."""
     import jax
 
     from bayessim_mjx import rl
@@ -83,7 +83,7 @@ def load_policy(path: Path, env: Any, config: Config) -> Any:
 
 
 def space_seen(run: "Run | None") -> Any:
-    """The parameters that the policy of a run sees, with the ranges in whose units it does; None: it sees none."""
+    """Return the parameters that the policy of a run sees, with the ranges of their units; None: it sees none."""
     from bayessim_mjx import registry
 
     if run is None or not run.config.ppo.policy_theta:
@@ -134,7 +134,7 @@ def _taught(which: str, config: Config, env: Any) -> tuple[Any, Any]:
 
 
 def warm_start(train: Any, config: Config, env: Any, say: Callable[[str], None] = lambda _: None) -> Any:
-    """The training state with actor and normaliser of `bayessim.policyCheckpt`, if that is set; the critic is new.
+    """Return the training state with actor and normaliser of `bayessim.policyCheckpt`, if set; the critic is new.
 
     `main` and `train` call it for the state that a run begins with, not when they resume one. `loop.init` does not read
     files: a program of your own that is to start from a policy calls this on `loop.init(parts).train`. With

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | None = None) -> Config:
-    """The configuration that flags (and `more` like them), files and overrides ask for; the task has to exist."""
+    """Return the configuration of flags (and `more` like them), files and overrides; the task has to exist."""
     flags = dict(more or {})
     for flag, (key, _, _) in FLAGS.items():
         value = getattr(args, flag[2:], None)  # not every command has every flag
@@ -35,14 +35,14 @@ def config_of(args: argparse.Namespace, more: Mapping[str, tuple[str, Any]] | No
 
 
 def _drawn() -> int:
-    """A seed from the system."""
+    """Return a seed from the system."""
     import random  # here, so that commands start fast
 
     return random.SystemRandom().randrange(10_000)
 
 
 def resumed_config(args: argparse.Namespace, config: Config, also: Sequence[str] = ()) -> Config:
-    """The settings of the run to resume, with what may change: devices, cache and videos. Anything else is refused.
+    """Return the settings of the run to resume; only devices, cache and videos may change.
 
     also: further flags that the command takes; it sees to what they set.
     """
@@ -56,7 +56,7 @@ def resumed_config(args: argparse.Namespace, config: Config, also: Sequence[str]
 
 
 def prolonged_config(args: argparse.Namespace, run: "Run") -> Config:
-    """The settings of the run of PPO alone to resume, with `--max_iterations` in all; the run may be finished.
+    """Return the settings of the run of PPO alone to resume, with `--max_iterations` in all; the run may be finished.
 
     Raises:
         UserError: the run has done as many iterations already.
@@ -79,7 +79,7 @@ def say_changes(run: "Run", console: Any) -> None:
 
 
 def task_name(name: str) -> str:
-    """The task's proper name; UserError with the close ones where there is none, or where its file has no such task."""
+    """Return the task's proper name; UserError with the close ones where there is none, or where its file has none."""
     from bayessim_mjx import registry
     from bayessim_mjx.outside_tasks import is_file
 

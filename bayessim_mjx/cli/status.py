@@ -84,7 +84,7 @@ def first_writes(config: Config, run: "Run | None") -> Iterator[tuple[Config, "R
 
 @contextlib.contextmanager
 def running(run: "Run", say: Callable[[str], Any]) -> Iterator[None]:
-    """The run's status: running while inside; then finished, interrupted (Ctrl-C) or failed (any error; `error`)."""
+    """Write the run's status: running while inside; then finished, interrupted (Ctrl-C) or failed (`error`)."""
     try:
         run.set_status("running")
         yield

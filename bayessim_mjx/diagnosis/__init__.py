@@ -17,7 +17,7 @@ _WHERE = {
     "Diagnosis": ("result", "Diagnosis"),
     "load": ("result", "load"),
     "robot": ("fitting.robot", "robot_of"),
-    "Verdict": ("verdicts", "Verdict"),
+    "Verdict": ("result", "Verdict"),
 }
 __all__ = ["Diagnosis", "Verdict", "diagnose", "load", "robot"]
 

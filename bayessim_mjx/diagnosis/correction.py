@@ -28,9 +28,11 @@ from bayessim_mjx.physics import Physics
 class Estimate:
     """One identified number.
 
-    bound: "" where it lies inside its range; "at least" or "at most" (nothing larger or smaller was tried), "end" (of
-    what physics allows, or of what the logs tell), "off" (it has no part in the effect). At a bound, but for "off", sd
-    is NaN: an interval around the end of a range says nothing.
+    Attributes:
+        mean, sd: value and standard deviation, in `unit`. sd is NaN at a bound, except "off".
+        bound: "" inside the range. An effect's range doubles while held-out evidence gains from it, up to a hundred
+            times. "at least", "at most": the estimate ends where nothing larger or smaller was tried. "end": physics
+            ends there, or a wider range explains no more. "off": the number has no part in the effect.
     """
 
     mean: float
@@ -76,16 +78,9 @@ class FoundEffect:
     shared: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
-@dataclasses.dataclass(frozen=True)
-class Limits:
-    """How wide the priors are that a correction writes. Rules of thumb, not measured."""
-
-    reach: float = 4.0  # sd that a range holds on both sides, where physics allows: all but 6e-5 of a Gaussian
-    least_sd: float = 1e-06  # of the range: ten roundings of float32; a prior needs a width
-    unknown_sd: float = 0.5  # of the way from neutral, where the diagnosis could not tell
-
-
-LIMITS = Limits()
+REACH = 4.0  # sd that a range holds on both sides, where physics allows: all but 6e-5 of a Gaussian; source: its tails
+LEAST_SD = float(np.finfo(np.float32).eps)  # of the range: a prior needs a width that float32 can resolve
+UNIFORM = 1 / math.sqrt(12)  # standard deviation of a uniform law, of its range
 OWN_EFFECTS = "effect_specs"  # in `Diagnosis.details`: {name: path.py:MyEffect} of effects that are not the library's
 
 
@@ -112,7 +107,7 @@ class Source(Protocol):
 
 
 def effects_of(diagnosis: Found) -> tuple[Effect, ...]:
-    """The effects found, with nominal = identified mean and prior Gaussian(mean, sd) truncated to a sensible range.
+    """Return the effects found, with nominal = identified mean and prior Gaussian(mean, sd), truncated to a range.
 
     One effect at several places is one `Effect` with values of its own at each; "all" is tied. Their order is the
     library's, as in the diagnosis (`in_order`).
@@ -139,7 +134,7 @@ def _effect(kind: type[Effect], found: list[FoundEffect]) -> Effect:
 
 
 def _in_order(kind: type[Effect], found: FoundEffect) -> list[Estimate]:
-    """The estimates of one place in the order of the effect's quantities."""
+    """Return the estimates of one place in the order of the effect's quantities."""
     names = [q.name for q in kind.quantities]
     for name in names:
         if name not in found.parameters or not math.isfinite(found.parameters[name].mean):
@@ -149,9 +144,10 @@ def _in_order(kind: type[Effect], found: FoundEffect) -> list[Estimate]:
 
 
 def _identified(p: Parameter, q: Quantity, e: Estimate) -> Parameter:
-    """The effect's parameter as identified; the library's range is widened where it must be."""
-    sd = e.sd if math.isfinite(e.sd) else LIMITS.unknown_sd * abs(e.mean - q.neutral)
-    low, high = min(p.low, e.mean - LIMITS.reach * sd), max(p.high, e.mean + LIMITS.reach * sd)
+    """Return the effect's parameter as identified; the library's range is widened where it must be."""
+    # at a bound: uniform from neutral to twice as far
+    sd = e.sd if math.isfinite(e.sd) else UNIFORM * 2 * abs(e.mean - q.neutral)
+    low, high = min(p.low, e.mean - REACH * sd), max(p.high, e.mean + REACH * sd)
     if q.low == q.neutral:  # beyond it the physics has no meaning
         low = p.low
     elif p.low > 0:  # a gain, a frequency: it stays positive
@@ -163,9 +159,7 @@ def _identified(p: Parameter, q: Quantity, e: Estimate) -> Parameter:
 
 def _gaussian(p: Parameter, mean: float, sd: float) -> Parameter:
     mean = min(max(mean, p.low), p.high)
-    return dataclasses.replace(
-        p, nominal=mean, prior="gaussian", mean=mean, sd=max(sd, LIMITS.least_sd * (p.high - p.low))
-    )
+    return dataclasses.replace(p, nominal=mean, prior="gaussian", mean=mean, sd=max(sd, LEAST_SD * (p.high - p.low)))
 
 
 def calibrated_of(diagnosis: Found, space: ParameterSpace) -> ParameterSpace:
@@ -187,7 +181,7 @@ def _calibrated(p: Parameter, found: dict | None) -> Parameter:
     if math.isnan(mean):
         return p
     wide = dataclasses.replace(p, low=min(p.low, mean), high=max(p.high, mean))
-    return _gaussian(wide, mean, (p.high - p.low) / math.sqrt(12) if math.isnan(sd) else sd)
+    return _gaussian(wide, mean, UNIFORM * (p.high - p.low) if math.isnan(sd) else sd)
 
 
 def _number(value: float | None) -> float:
@@ -195,7 +189,7 @@ def _number(value: float | None) -> float:
 
 
 def apply(diagnosis: Found, physics: Physics) -> Physics:
-    """The corrected simulator: the same model and control step; nominal values are the identified ones.
+    """Return the corrected simulator: the same model and control step; nominal values are the identified ones.
 
     Args:
         physics: with the known parameters as its `model_space`; its effects are replaced by those found.
@@ -209,7 +203,7 @@ def apply(diagnosis: Found, physics: Physics) -> Physics:
 
 
 def prior(diagnosis: Found, physics: Physics | ParameterSpace | None = None) -> Distribution:
-    """What is known of the corrected simulator's theta: jointly Gaussian, truncated to the ranges.
+    """Return the distribution of the corrected simulator's theta: jointly Gaussian, truncated to the ranges.
 
     Where a diagnosis brings no covariance, the parameters are independent. Else the distribution's space has the names
     and ranges of the corrected simulator's, but uniform priors: over those a Gaussian is exact.
@@ -236,18 +230,18 @@ def _jointly(covariance: dict, space: ParameterSpace) -> Distribution:
     at = [space.index(n) for n in found]
     of = [covariance["names"].index(n) for n in found]
     known = np.asarray(covariance["matrix"], float)[np.ix_(of, of)]
-    least = (LIMITS.least_sd * width[at]) ** 2
+    least = (LEAST_SD * width[at]) ** 2
     matrix[np.ix_(at, at)] = known + np.diag(np.maximum(least - np.diag(known), 0.0))
     return Distribution.gaussian(flat, np.asarray(space.nominal, float), matrix)
 
 
 def _recorded(name: str, row: dict) -> Parameter:
-    """A known parameter by what diagnosis.json tells of it; it cannot be written into a model."""
+    """Return a known parameter by its record in diagnosis.json; it cannot be written into a model."""
     return Parameter(name, row["nominal"], row["low"], row["high"], unit=row.get("unit") or "")
 
 
 def correction(diagnosis: Found, space: ParameterSpace) -> storage.Correction:
-    """The effects found, and those parameters of `space` that were calibrated: the contents of effects.yaml."""
+    """Return the effects found, and those parameters of `space` that were calibrated: the contents of effects.yaml."""
     known = calibrated_of(diagnosis, space).parameters
     return storage.Correction(effects_of(diagnosis), tuple(p for p in known if p not in space.parameters))
 
@@ -289,7 +283,7 @@ def _friction_acting(spec: mujoco.MjSpec) -> mujoco.MjSpec:
 
 
 def _at_home(spec: mujoco.MjSpec, folder: str) -> mujoco.MjSpec:
-    """The specification with its meshes and textures where they are, wherever its XML will lie."""
+    """Return the specification with its meshes and textures where they are, wherever its XML will lie."""
     if folder:
         spec.meshdir = str((Path(folder) / spec.meshdir).resolve())
         spec.texturedir = str((Path(folder) / spec.texturedir).resolve())

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import fnmatch
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from bayessim_mjx.effects.support.site import element_names
 from bayessim_mjx.errors import UserError
@@ -24,17 +26,19 @@ Array = NDArray[np.float64]
 # 1350, benchmarks/records/diagnosis_fresh.json).
 ACCURACY = 0.07  # share of the stated value; source: the record above
 SURE = 2.0  # degrees of freedom; source: the record above
-WORST = 0.3  # a data sheet that is less accurate is another robot's; source: the worst of the cases of that record
+WORST = ACCURACY * float(stdtrit(SURE, 0.975))  # .30, end of the 95 % range: a worse data sheet is another robot's
 # What drives have that models leave out or guess: where inertia, damping and friction are all larger than modelled,
 # one number of a gain takes their place, and one by one none of them does. Not counted: docs/decisions/drive_laws.md
 DRIVES = ("coulomb_friction", "viscous_friction", "armature")
+FORM = re.compile(r"(?P<value>[-+]?[0-9.]+(?:e[-+]?[0-9]+)?)\s*(?P<unit>%|[a-z]*)")
 
 
 def accuracies(texts: Sequence[str], space: ParameterSpace, default: float | None) -> dict[str, float]:
     """{parameter: standard deviation as a share of its nominal value} of `5%`, `mass=2%`, `elbow*=20%`, also in one.
 
     A name is one of a parameter, of what it changes (mass, damping, armature, friction) or of the element that has it,
-    or a pattern. Later ones go before earlier ones; a parameter whose own prior is Gaussian keeps that.
+    or a pattern. Named ones go before those for all, later ones before earlier ones. A parameter whose own prior is
+    Gaussian keeps that.
 
     Args:
         default: of what nothing is said of; None: nothing is stated of it.
@@ -43,9 +47,8 @@ def accuracies(texts: Sequence[str], space: ParameterSpace, default: float | Non
         UserError: no such parameter, or no share above 0.
     """
     own = {p.name: default for p in space.parameters if default is not None and _open(p)}
-    for part in (p.strip() for text in texts for p in text.split(",") if p.strip()):
-        name, _, value = part.rpartition("=")
-        share = _number(part, value, "%", "--accuracy", "a share above 0, as in 5% or mass=2%") / 100
+    for part, name, value in assigned(texts):
+        share, _ = measure(f"--accuracy {part}", value, {"%": 0.01, "": 1.0}, "a share above 0, as in 5% or mass=2%")
         named = [p.name for p in space.parameters if not name or _called(p, name)]
         if not named:
             every = [*dict.fromkeys(p.attribute for p in space.parameters), *space.names]
@@ -72,9 +75,9 @@ def rating(texts: Sequence[str], model: mujoco.MjModel) -> dict[int, float]:
     moving = [b for b in range(1, model.nbody) if model.body_weldid[b] != 0]
     names = {element_names(model, "body")[b]: b for b in moving}
     out: dict[int, float] = {}
-    for part in sorted((p.strip() for text in texts for p in text.split(",") if p.strip()), key=lambda p: "=" in p):
-        name, _, value = part.rpartition("=")
-        mass = _number(part, value, "kg", "--payload", "a mass above 0 in kg, as in 12kg or tool=12kg")
+    for part, name, value in assigned(texts):
+        allowed = "a mass above 0 in kg, as in 12kg or tool=12kg"
+        mass, _ = measure(f"--payload {part}", value, {"kg": 1.0, "": 1.0}, allowed)
         if name and name not in names:
             raise UserError(f"--payload {part}: no moving body {name!r}; {suggest(name, names)}")
         out |= dict.fromkeys([names[name]] if name else moving, mass)
@@ -89,11 +92,34 @@ def rated(carried: Array, given: Mapping[int, float]) -> Array:
     return out
 
 
-def _number(part: str, text: str, unit: str, flag: str, allowed: str) -> float:
+def assigned(texts: Sequence[str]) -> Iterator[tuple[str, str, str]]:
+    """Split `5%`, `mass=2%`, also in one text with commas, into (part, name or "", value); values for all first."""
+    parts = [p.strip() for text in texts for p in text.split(",") if p.strip()]
+    for part in sorted(parts, key=lambda p: "=" in p):
+        name, _, value = part.rpartition("=")
+        yield part, name, value
+
+
+def measure(flag: str, text: str, units: Mapping[str, float], allowed: str, has: str = "") -> tuple[float, str]:
+    """(value in the unit of the factors, unit as typed) of `5mm`.
+
+    Args:
+        flag: with its value, as typed. units: {unit: factor}; with "" among them a number may stand alone.
+        allowed: values in words; has: the units that there are, in words.
+
+    Raises:
+        UserError: no number, no such unit, or no number above 0.
+    """
+    found = FORM.fullmatch(text.strip())
     try:
-        value = float(text.strip().removesuffix(unit))
+        value = float(found["value"]) if found else math.nan
     except ValueError:
-        raise UserError(f"{flag} {part}: {text!r} is no number; allowed: {allowed}") from None
+        value = math.nan
+    if not found or math.isnan(value):
+        raise UserError(f"{flag}: {text!r} is no number; allowed: {allowed}")
+    if found["unit"] not in units:
+        why = f"{has}, not in {found['unit']}" if found["unit"] and has else f"{text} has no such unit"
+        raise UserError(f"{flag}: {why if found['unit'] else f'{text} has no unit'}; allowed: {allowed}")
     if not 0 < value < math.inf:
-        raise UserError(f"{flag} {part}: {text} is not above 0; allowed: {allowed}")
-    return value * (100 if unit == "%" and not text.strip().endswith("%") else 1)
+        raise UserError(f"{flag}: {text} is not above 0; allowed: {allowed}")
+    return value * units[found["unit"]], found["unit"]

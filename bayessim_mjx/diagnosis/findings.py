@@ -1,18 +1,21 @@
-"""All that a diagnosis computed, before it is put into words, and who observes it while it runs."""
+"""All that a diagnosis computed, before it is put into words; its stages, and who observes it while it runs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, TypeVar
 
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.logcheck.links import Link
+from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
 from bayessim_mjx.diagnosis.residual.frequency import Heard
 from bayessim_mjx.diagnosis.residual.where import Located
+from bayessim_mjx.diagnosis.selection.budget import Budget, Progress
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
@@ -59,11 +62,11 @@ class Findings:
         return self.selection.answer
 
     def having(self, part: Any) -> Findings:
-        """The findings with the result of one more stage."""
+        """Return the findings with the result of one more stage."""
         return replace(self, parts=MappingProxyType({**self.parts, type(part): part}))
 
     def part(self, kind: type[T]) -> T | None:
-        """The result of the stage whose part has this class; None if it did not run or found nothing."""
+        """Return the result of the stage whose part has this class; None if it did not run or found nothing."""
         return self.parts.get(kind)
 
 
@@ -71,13 +74,93 @@ class Observer:
     """What a diagnosis calls while it runs; every method does nothing unless a subclass overrides it."""
 
     def progress(self, text: str, done: int, total: int) -> None:
-        """Called when a part begins and while it goes on: what is being done, and how much of it is done."""
+        """Take the name of a part, when it begins and while it goes on, and how much of it is done."""
 
     def early(self, lines: Sequence[str]) -> None:
-        """Called with what the logs show before any simulation, in lines."""
+        """Take what the logs show before any simulation, in lines."""
 
     def known(self, setup: Setup, state: SearchState | None) -> None:
-        """Called before the search (None), and after each part of it with what was fitted so far."""
+        """Take what was fitted so far: before the search (None) and after each part of it."""
 
     def verdict(self, found: Findings) -> None:
-        """Called with the findings before the optional stages."""
+        """Take the findings before the optional stages."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage: its name, which is shown while it runs, and `run(findings, say) -> findings`.
+
+    Attributes:
+        optional: the verdict does not need it; its failure becomes a warning.
+        patient: it is left out if the time is over.
+        beside: it needs no result of other such stages, and adds only its own part. Such stages run together, as each
+            compiles a small program, which leaves cores free.
+    """
+
+    name: str
+    run: Callable[[Findings, Progress], Findings]
+    optional: bool = False
+    patient: bool = False
+    beside: bool = False
+
+    def after(self, found: Findings, say: Progress, time_left: Budget = Budget()) -> Findings:  # noqa: B008  # immutable
+        """Return the findings after this stage; without it and with a note where it failed or the time was over.
+
+        The verdict stands: a missing picture or proposal must not lose it.
+        """
+        if (self.patient or self.optional) and time_left.late:
+            return replace(found, warnings=(*found.warnings, notes.left_out(self.name)))
+        try:
+            return self.run(found, say)
+        except Exception as error:
+            if not self.optional:
+                raise
+            return replace(found, warnings=(*found.warnings, notes.left_out(self.name, error)))
+
+
+def carry_out(stages: Sequence[Stage], found: Findings, time_left: Budget, observer: Observer) -> Findings:
+    """Run all stages; the observer gets the verdict once all stages that are not optional have run.
+
+    Under a limit of time they run one after the other, and a stage is left out if the time is over at its turn.
+    """
+    beside = [] if time_left.limited else [s for s in stages if s.beside]
+    alone = [s for s in stages if s not in beside]
+    for stage in (s for s in alone if not s.optional):
+        observer.progress(stage.name, 0, 1)
+        found = stage.after(found, observer.progress, time_left)
+    if beside:
+        found = _together(beside, found, observer)
+    else:
+        observer.verdict(found)
+    for stage in (s for s in alone if s.optional):
+        observer.progress(stage.name, 0, 1)
+        found = stage.after(found, observer.progress, time_left)
+    return found
+
+
+def _together(stages: Sequence[Stage], found: Findings, observer: Observer) -> Findings:
+    """Run each stage on a thread: compilation and simulation release Python's lock."""
+    name = ", ".join(s.name for s in stages)
+    done: list[Stage] = []
+
+    def one(stage: Stage) -> Findings:
+        after = stage.after(found, lambda text, done, total: None)
+        done.append(stage)
+        observer.progress(name, len(done), len(stages))
+        return after
+
+    observer.progress(name, 0, len(stages))
+    with ThreadPoolExecutor(len(stages)) as pool:
+        running = {stage.name: pool.submit(one, stage) for stage in stages}
+        needed = [running[s.name] for s in stages if not s.optional]
+        observer.verdict(_joined(found, needed))
+    return _joined(found, running.values())
+
+
+def _joined(found: Findings, running: Iterable[Future[Findings]]) -> Findings:
+    """Return the findings with the parts and warnings of stages that began with `found`."""
+    each = [future.result() for future in running]
+    parts = {kind: part for after in each for kind, part in after.parts.items()}
+    warnings = [text for after in each for text in after.warnings[len(found.warnings) :]]
+    both = {**found.parts, **parts}
+    return replace(found, parts=MappingProxyType(both), warnings=(*found.warnings, *warnings))

@@ -1,4 +1,4 @@
-"""What a diagnosis says: plain dataclasses of numbers and words, to and from JSON. The report renders them."""
+"""The result of a diagnosis: plain dataclasses of numbers and words, to and from JSON. The report renders them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,33 @@ import numpy as np
 from bayessim_mjx import atomic
 from bayessim_mjx.diagnosis import correction
 from bayessim_mjx.diagnosis.correction import Estimate, FoundEffect
-from bayessim_mjx.diagnosis.verdicts import Verdict
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics
 
 SCHEMA = 1
+
+
+class Verdict(StrEnum):
+    """One of seven verdicts; it is a string, its code. `words` is its title in reports, on the terminal and in docs."""
+
+    words: str
+
+    def __new__(cls, code: str, words: str = "") -> Verdict:
+        """Find the member of a code."""
+        member = str.__new__(cls, code)
+        member._value_, member.words = code, words
+        return member
+
+    NO_GAP = "no_gap", "No gap"
+    PARAMETERS = "parameters", "Parameters only"
+    NOISE = "noise", "Noise larger than estimated"
+    EFFECTS = "effects", "Missing effects found"
+    AMBIGUOUS = "ambiguous", "Ambiguous"
+    UNEXPLAINED = "unexplained", "Unexplained"
+    INSUFFICIENT_DATA = "insufficient_data", "Too little data"
+
+
 VERDICTS = tuple(Verdict)
 
 
@@ -38,20 +60,33 @@ class Place:
 class Gap:
     """Root mean square of measured minus simulated motion on held-out windows, in units of the measurement noise.
 
-    reducible_floor: what no model undercuts: what runs of the same commands differ by, or the noise.
-    horizons: [{"name": "0.25 s", "seconds", "nominal", "calibrated", "with_effects", "reducible_floor", "noise_floor",
-    "floor": "noise", "repeats" or "start" (of a long simulation), "ci": {stage: [lo, hi]}, "physical", "shares"}];
-    by_channel: {joint: {stage: value}}; physical: {joint: {stage: value, "unit"}}, rad or m, and "noise", "motion" (the
-    range of the logged motion), "tolerance", "largest" (error that the last stage leaves), "beyond" (whether it leaves
-    more than tolerated); shares: {stage: value}, of the range of motion, root mean square over the joints; beyond: the
-    joints where more than tolerated remains;
-    closed: {"predicted", "realised", "ci", "nested", "elsewhere"}, share of the recalibrated simulator's squared gap
-    above the noise that all effects close together: as promised before any was fitted, on held-out windows afterwards,
-    and on conditions that the choice of the effects was made without (the costs behind it were not); nested: whether
-    realised and ci are of such conditions too; integrator: what the simulator's own time step is worth
-    (`discretisation.Discretisation.to_dict`); coasting: the same without any simulator, every joint keeping its speed
-    (`how_far.constant_velocity_baseline`); in_sample: whether there is one log, of which parts are held out; of the
-    horizon of whole logs `in_sample` counts the logs that are simulated with parameters that were fitted to them.
+    A window has half a second, at least 8 and at most 100 control steps (`fitting.cutting.CUTTING`). With contacts it
+    is halved, twice at most, until the error of the time step is below 5 noises. Each window starts at the measured
+    state. *Stages* are the keys `nominal`, `calibrated`, `with_effects`, `reducible_floor` and `noise_floor`.
+
+    Attributes:
+        noise_floor: 1, the noise itself.
+        nominal, calibrated, with_effects: the simulator as delivered, recalibrated, and with the effects found.
+        reducible_floor: the least of any model: the difference of runs with the same commands, or the noise.
+        unit: of all of them.
+        by_channel: {joint: {stage: value}}.
+        horizons: [{"name": "0.25 s", "seconds", each stage, "floor": "noise", "repeats" or "start" (of a long
+            simulation), "ci": {stage: [low, high]} (90 %), "physical", "shares"}], the window's and others. That of
+            whole logs has "over_likely" (rms error over the likely one) and "in_sample": the number of logs that are
+            simulated with parameters that were fitted to them.
+        physical: {joint: {stage: rad or m, "unit", "noise", "motion": range of the logged motion, "tolerance",
+            "largest": error of the last stage, "beyond": whether more than the tolerance remains}}.
+        shares: {stage: share of the range of motion, rms over the joints}.
+        beyond: joints where more than the tolerance remains.
+        closed: {"predicted", "realised", "ci", "nested", "elsewhere"}: share of the recalibrated simulator's squared
+            gap above the noise that all effects close. `predicted`: by one linear step before any fit. `realised`: on
+            windows whose condition the fit had not seen, with its 90 % interval `ci`. `nested`: whether the effects
+            were chosen without that condition too (from three conditions on). `elsewhere`: where only the choice was
+            made without it. Both are biased upwards a little: the fits that the choice compares had seen every
+            condition.
+        integrator: error of the simulator's own time step (`discretisation.Discretisation.to_dict`).
+        coasting: the gap without any simulator, every joint keeping its speed; None: not known.
+        in_sample: whether there is one log only, of which parts are held out.
     """
 
     noise_floor: float
@@ -129,7 +164,7 @@ class Diagnosis:
         object.__setattr__(self, "verdict", Verdict(self.verdict))
 
     def to_dict(self) -> dict[str, Any]:
-        """The contents of diagnosis.json; numbers that are not finite become null."""
+        """Return the contents of diagnosis.json; numbers that are not finite become null."""
         out = {"schema": self.schema} | {
             f.name: plain(getattr(self, f.name))
             for f in dataclasses.fields(self)
@@ -138,11 +173,11 @@ class Diagnosis:
         return out
 
     def apply(self, physics: Physics) -> Physics:
-        """The corrected simulator, see `correction.apply`."""
+        """Return the corrected simulator, see `correction.apply`."""
         return correction.apply(self, physics)
 
     def prior(self, physics: Physics | ParameterSpace | None = None) -> Distribution:
-        """What is known of the corrected simulator's theta, for the loop; see `correction.prior`."""
+        """Return the distribution of the corrected simulator's theta, for the loop; see `correction.prior`."""
         return correction.prior(self, physics)
 
     def save(self, folder: str | Path) -> Path:
@@ -156,7 +191,7 @@ class Diagnosis:
 
 
 def load(folder: str | Path) -> Diagnosis:
-    """A saved diagnosis; what was not finite is NaN again."""
+    """Return a saved diagnosis; what was not finite is NaN again."""
     folder = Path(folder)
     raw: dict[str, Any] = json.loads((folder / "diagnosis.json").read_text())
     details = folder / "details.json"

@@ -1,4 +1,4 @@
-"""The diagnosis from logs to result: what was logged, the selection, and the stages after it."""
+"""The diagnosis from logs to result: setup, selection, and the stages after it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -17,21 +18,85 @@ from threadpoolctl import threadpool_limits
 
 from bayessim_mjx import programs, versions
 from bayessim_mjx.diagnosis.evidence import selecting
-from bayessim_mjx.diagnosis.findings import Findings, Observer
+from bayessim_mjx.diagnosis.experiment import propose
+from bayessim_mjx.diagnosis.findings import Findings, Observer, Stage, Where, carry_out
 from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
 from bayessim_mjx.diagnosis.fitting.journal import Journal, Remembering, digest
 from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, robot_of
+from bayessim_mjx.diagnosis.logcheck.links import links as links_of
 from bayessim_mjx.diagnosis.phrases import first_look
 from bayessim_mjx.diagnosis.request import Effects, Request
+from bayessim_mjx.diagnosis.residual import black_boxes, frequency, where
+from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
+from bayessim_mjx.diagnosis.residual.flexible import Flexible, flexible
 from bayessim_mjx.diagnosis.result import Diagnosis
-from bayessim_mjx.diagnosis.selection import budget
+from bayessim_mjx.diagnosis.selection import budget, heldout
 from bayessim_mjx.diagnosis.selection.budget import Progress
+from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup, prepare
-from bayessim_mjx.diagnosis.stages import STAGES, Stage, carry_out
-from bayessim_mjx.diagnosis.summary import assemble
+from bayessim_mjx.diagnosis.summary import again
 from bayessim_mjx.diagnosis.summary.files import Files
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Log
+
+
+def how_far(found: Findings, say: Progress) -> Findings:
+    """Add the held-out motion of the simulator as delivered, recalibrated and with the effects."""
+    fitter, base, model = found.setup.fitter, found.selection.state.base, found.model
+    predictions = {
+        "nominal": heldout.nominal(fitter, found.selection.state.nominal),
+        "calibrated": heldout.predict(fitter, base),
+    }
+    predictions["with_effects"] = heldout.predict(fitter, model) if model.effects else predictions["calibrated"]
+    return replace(found, predictions=MappingProxyType(predictions))
+
+
+def none_of_these(found: Findings, say: Progress) -> Findings:
+    """Add the missing force, a flexible force fitted to it, and the checks of the links of the actuator chain."""
+    base, model, setup = found.selection.state.base, found.model, found.setup
+    missing = estimate(setup.fitter, base.fit) if found.selection.state.above_noise(base) else None
+    on_base = _flexible(found, base, missing)
+    on_winner = _flexible(found, model) if model.effects else on_base
+    links = tuple(link for log in setup.logs[:1] for link in links_of(log, setup.robot.mj_model, setup.gate.timing))
+    return replace(found, disturbance=missing, flexible_base=on_base, flexible_winner=on_winner, links=links)
+
+
+def _flexible(found: Findings, model: Model, missing: Disturbance | None = None) -> Flexible | None:
+    """Return a flexible force on top of a model; None if the model leaves no more than noise."""
+    if not found.selection.state.above_noise(model):
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return flexible(found.setup.fitter, model.fit, missing)
+
+
+def where_it_lies(found: Findings, say: Progress) -> Findings:
+    """Add the places of the recalibrated simulator's gap, maps of the missing force and its spectra."""
+    if found.disturbance is None:
+        return found
+    fitter, fit = found.setup.fitter, found.selection.state.base.fit
+    located = where.locate(fitter, fit, found.disturbance, seed=found.setup.seed)
+    return found.having(Where(located, frequency.analyse(fitter, fit, found.disturbance)))
+
+
+def rivals_without_physics(found: Findings, say: Progress) -> Findings:
+    """Add the shares of the gap that a network and a formula close, beside those of the named effects."""
+    if found.disturbance is None:
+        return found
+    state, named = found.selection.state, found.model.fit if found.model.effects else None
+    boxes = black_boxes.race(found.setup.fitter, state.base.fit, named, found.disturbance, state.noise)
+    return found if boxes is None else found.having(boxes)
+
+
+STAGES = (
+    Stage("how far", how_far),
+    Stage("none of these?", none_of_these),
+    Stage("finer steps", again.at_finer_steps, patient=True, beside=True),
+    Stage("whole logs", again.over_whole_logs, patient=True, beside=True),
+    Stage("where", where_it_lies, optional=True, beside=True),
+    Stage("black boxes", rivals_without_physics, optional=True, beside=True),
+    Stage("next experiment", propose.stage, optional=True, beside=True),
+)
 
 
 # its matrices are small: BLAS's threads take longer than one, and many times that where other processes want the cores
@@ -43,7 +108,7 @@ def investigate(
     observer: Observer = Observer(),  # noqa: B008  # has no state
     stages: Sequence[Stage] | None = None,
 ) -> Findings:
-    """The whole computation, before its results are put into words or written.
+    """Compute everything, before results are put into words or written.
 
     Args:
         robot: the model with the parameters that it may recalibrate.
@@ -123,12 +188,12 @@ def diagnose(
     try:
         found = investigate(robot, recorded, request, files)
     except TooLittleData as reason:
-        return files.whole(assemble.insufficient(str(reason), request.notes, about), robot)
+        return files.insufficient(str(reason), request.notes, robot)
     return files.whole(files.result(found), robot)
 
 
 def remembering(setup: Setup, folder: Path | None) -> Setup:
-    """The setup with a fitter that stores its fits in a folder, and finds there those of an interrupted search."""
+    """Return the setup with a fitter that stores its fits in a folder, and finds those of an interrupted search."""
     if folder is None:
         return setup
     return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, *_asked(setup))))
@@ -164,7 +229,7 @@ def _header(robot: Robot, model: Source, logs: Any, recorded: Sequence[Log]) -> 
 
 @contextmanager
 def noting() -> Iterator[list[str]]:
-    """A list that holds the warnings of its block, each once, when the block ends."""
+    """Return a list that holds the warnings of its block, each once, when the block ends."""
     notes: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import tolerance
 from bayessim_mjx.diagnosis.equation_error import inverse_dynamics_check
 from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.fitting import (
@@ -29,7 +28,8 @@ from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck import gate, noise
-from bayessim_mjx.diagnosis.request import Request
+from bayessim_mjx.diagnosis.phrases import notes
+from bayessim_mjx.diagnosis.request import Request, Tolerance, tolerances
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.search_state import Settings
 from bayessim_mjx.effects.support.motion import AROUND
@@ -65,7 +65,7 @@ class Setup:
     scales: scales.Scales
     settings: Settings
     seed: int
-    tolerance: tolerance.Tolerance
+    tolerance: Tolerance
     warnings: tuple[str, ...] = ()
     said: tuple[str, ...] = ()
     discretisation: discretisation.Discretisation | None = None
@@ -119,7 +119,7 @@ class _Timed:
     warnings: tuple[str, ...]
 
     def cut(self, physics: Physics, quick: bool) -> Windows:
-        """The windows that models are fitted to."""
+        """Return the windows that models are fitted to."""
         steps = self.step.errors.cut.steps if self.step.errors else self.cuts(1).steps
         most = most_windows(physics, steps, quick)
         return self.step.noisier(self.cuts(self.step.factor, limit=most, centred=False, late=self.gate.timing.moved))
@@ -141,20 +141,21 @@ def prepare(
         UserError: unknown effects, no usable log, a tolerance that cannot be read.
         TooLittleData: too few windows.
     """
-    tolerated = tolerance.read(request.tolerances, robot.mj_model)
+    tolerated = tolerances(request.tolerances, robot.mj_model)
     checked = _checked(robot, logs, request, looked)
     usable = checked.gate.usable
     size = scales.measure(checked.robot.mj_model, [resample(log, checked.dt) for log in usable], robot.rating)
     stack, left_out = candidates.stack(candidates.kinds_of(request.effects), size)
-    judge = functools.partial(tolerance.judge, checked.robot.mj_model, 2 * size.travel, asked=tolerated)
-    timed = _timed(checked, size, judge(noise.noise_of_positions(usable)).limit, request.group, budget)
+    allows = functools.partial(tolerated, 2 * size.travel)
+    timed = _timed(checked, size, allows(noise.noise_of_positions(usable)).limit, request.group, budget)
     physics = physics_of(timed.robot, checked.dt, stack)
     cut = timed.cut(physics, request.quick)
     base = candidates.base_coordinates(timed.robot.space, timed.robot.accuracy, timed.robot.assumed)
     led = inverse_dynamics_check.lead(candidates.enumerate_candidates(physics), checked.look)
-    allowed = judge(cut.sigma_q)
+    allowed = allows(cut.sigma_q)
     untried = [f"not tried: {text}" for text in left_out]
-    warnings = [*checked.notes, *timed.notes, *timed.warnings, *untried, *_few_conditions(cut)]
+    few = [*notes.conditions(len(cut.groups), cut.blocks), *notes.below_noise(allowed)]
+    warnings = [*checked.notes, *timed.notes, *timed.warnings, *untried, *cut.notes, *noise.not_compared(usable), *few]
     own = Settings(screened=24) if robot.mj_model.nv > CUTTING.many else Settings()
     settings = request.settings or (QUICK if request.quick else own)
     return Setup(
@@ -167,7 +168,7 @@ def prepare(
         settings=dataclasses.replace(settings, believed=timed.step.believed, budget=budget),
         seed=request.seed,
         tolerance=allowed,
-        warnings=(*warnings, *noise.not_compared(usable), *allowed.warnings(), *led.sentences()),
+        warnings=(*warnings, *led.sentences()),
         said=timed.notes,
         discretisation=timed.step,
         look=checked.look,
@@ -175,16 +176,16 @@ def prepare(
 
 
 def _checked(robot: Robot, logs: Sequence[Log], request: Request, looked: Callable[[Look], None]) -> _Checked:
-    """The logs after the gate, cut where they begin to be usable, and their notes."""
-    dt, notes = control_period(robot, logs), [*request.notes]
-    found, look = inverse_dynamics_check.checked(logs, robot, dt, notes, looked)
+    """Return the logs after the gate, cut where they begin to be usable, and their notes."""
+    dt, said = control_period(robot, logs), [*request.notes]
+    found, look = inverse_dynamics_check.checked(logs, robot, dt, said, looked)
     seconds = at_most(robot.mj_model.nv, request.quick) * (CUTTING.window + AROUND)  # that all windows hold together
     beginnings, shorter = observation.shortened(found.demand(), seconds)
     found = found.of_logs(observation.completed(beginnings, robot.mj_model))
-    notes += [*found.warnings, *shorter, *(f"{text} (found, not assumed)" for text in found.findings)]
-    notes += [] if noise.repeats(found.usable) else [noise.ONCE]
+    said += [*found.warnings, *shorter, *(f"{text} (found, not assumed)" for text in found.findings)]
+    said += [] if noise.repeats(found.usable) else [noise.ONCE]
     period = float(np.median([log.period for log in logs]))
-    return _Checked(pruned(robot, found.usable, dt), dt, period, found, look, tuple(notes))
+    return _Checked(pruned(robot, found.usable, dt), dt, period, found, look, tuple(said))
 
 
 def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | None, budget: Budget) -> _Timed:
@@ -194,11 +195,16 @@ def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | No
     left = (budget.seconds - budget.spent) / CUTTING.simulations  # s for one simulation of all windows
     steps = integrator_choice.choose(checked.robot, dt, usable, measured, left)
     cuts, step = steps.cuts, steps.worth
-    shift = _shift(cuts, step, size)
+    shift, factor = None, min(step.factor, step.errors.finest) if step.errors else step.factor
+    if step.errors is not None and step.errors.physics.mj_model.nu:  # by how much commands act later than logged
+        shift = command_shift.estimate(
+            step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
+        )
     late = [] if shift is None else shift.notes(checked.period)
     clocked = checked.gate if shift is None else checked.gate.moved(shift.lead)
-    notes = [*steps.said(), *_faster(usable, float(checked.robot.mj_model.opt.timestep), dt), *late]
-    return _Timed(step.robot(steps.robot), clocked, cuts, step, tuple(notes), tuple(steps.warnings()))
+    period, timestep = float(np.median([log.period for log in usable])), float(checked.robot.mj_model.opt.timestep)
+    said = [*steps.said(), *notes.rows(period, timestep, dt, dt <= 2 * CUTTING.shortest), *late]
+    return _Timed(step.robot(steps.robot), clocked, cuts, step, tuple(said), tuple(steps.warnings()))
 
 
 def _measured(
@@ -210,7 +216,7 @@ def _measured(
     first: int = 1,
     cheaper: Errors | None = None,
 ) -> tuple[Callable[..., Windows], discretisation.Discretisation]:
-    """The windows, and what the time step is worth in them; shorter ones where contacts make longer ones a lottery.
+    """Return the windows and the error of the time step in them; shorter ones where contacts make it large.
 
     Args:
         limit: `[nv]`, the tolerance: steps are made finer than the budget allows until they are worth less; None: they
@@ -227,34 +233,3 @@ def _measured(
         if worth < CUTTING.lottery or not contacts(own) or cuts(1).steps <= CUTTING.shortest_window:
             break
     return cuts, step
-
-
-def _shift(
-    cuts: Callable[..., Windows], step: discretisation.Discretisation, size: scales.Scales
-) -> command_shift.Shift | None:
-    """By how much commands act later or earlier than the logs say."""
-    if step.errors is None or not step.errors.physics.mj_model.nu:
-        return None
-    factor = min(step.factor, step.errors.finest)
-    return command_shift.estimate(
-        step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
-    )
-
-
-def _faster(logs: Sequence[Log], timestep: float, dt: float) -> list[str]:
-    """What logs faster than the simulator, or than the diagnosis goes, are told."""
-    period = float(np.median([log.period for log in logs]))
-    if period < dt * (1 - 1e-6) and dt <= 2 * CUTTING.shortest:
-        return [f"the logs have a row every {1e3 * period:.3g} ms; one every {1e3 * dt:.3g} ms is compared"]
-    if timestep > dt * (1 + 1e-6):
-        text = f"the logs have a row every {1e3 * period:.3g} ms, and the model steps {1e3 * timestep:.3g} ms"
-        return [f"{text}: it is simulated at {1e3 * dt:.3g} ms"]
-    return []
-
-
-def _few_conditions(cut: Windows) -> list[str]:
-    count = len(cut.groups)
-    if cut.blocks:
-        text = "one log is one operating condition: blocks of it in time are held out, so all numbers are in sample"
-        return [*cut.notes, f"{text}, and no interval between conditions is given"]
-    return [*cut.notes, *([f"{count} operating conditions: intervals are rough"] if count < 4 else [])]

@@ -1,7 +1,11 @@
-"""Uncertainty from few operating conditions: a jackknife over conditions, with Student's t.
+"""The gap between a simulator and the logs, above the noise; uncertainty from few operating conditions.
 
-Windows of one condition err alike, as the model errs there alike. So conditions are what is independent, however few
-they are; of one condition alone nothing can be said. Coverage of the intervals: benchmarks/diagnosis/intervals.py.
+Whatever says in numbers or words which share of a gap is closed or left reads it here, so that no sentence contradicts
+the numbers beside it.
+
+Uncertainty: a jackknife over conditions, with Student's t. Windows of one condition err alike, as the model errs there
+alike. So conditions are what is independent, however few they are; of one condition alone nothing can be said. Coverage
+of the intervals: benchmarks/diagnosis/intervals.py.
 """
 
 from __future__ import annotations
@@ -9,20 +13,86 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 from scipy.optimize import nnls
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri, ndtri_exp
 
 Array = NDArray[np.float64]
 
 
-Z90 = 1.645  # half the width of a Gaussian's 90 % interval, in standard deviations; source: its 95 % quantile
+Z90 = float(ndtri(0.95))  # half the width of a Gaussian's 90 % interval, in standard deviations
 RULED = 0.5  # degrees of freedom where one condition rules a mean of squares; coverage as measured, see above
 NOTHING = (float("nan"), float("nan"))  # the interval of one condition
+
+
+# Root mean square residual, in noise standard deviations, up to which a model is at the noise. It decides words, and
+# whether the gap is located; verdicts rest on `selection.numbers.FLOOR` and on the force that is left. Counted:
+# docs/decisions/at_noise.md
+AT_NOISE = 1.15
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Squared residuals of one set of windows, under two models and under the noise alone; all in the same unit.
+
+        closed = (E0 - max(E1, N)) / (E0 - N),  left = max(E1 - N, 0) / (E0 - N) = 1 - closed
+
+    Attributes:
+        before, after: E0 and E1, of the worse and of the better model, sums or means of squares.
+        noise: N, what a perfect model leaves; 1 where residuals are in noise standard deviations.
+    """
+
+    before: float
+    after: float
+    noise: float = 1.0
+
+    def share(self, part: float) -> float:
+        """Return a part of E0 as a share of the squared gap above the noise, E0 - N; NaN where nothing is above it."""
+        above = self.before - self.noise
+        return part / above if above > 0.0 else math.nan
+
+    @property
+    def closed(self) -> float:
+        """Share of the squared gap above the noise that is closed: at most 1, below 0 where it grows, NaN of none.
+
+        Nothing undercuts the noise: the best of many models is below its own expected error by selection.
+        """
+        return self.share(self.before - max(self.after, self.noise))
+
+    @property
+    def left(self) -> float:
+        """Share of the squared gap above the noise that is left, at least 0; NaN of none."""
+        return self.share(max(self.after - self.noise, 0.0))
+
+    @property
+    def rms(self) -> float:
+        """Root mean square residual of the better model, in noise standard deviations."""
+        return math.sqrt(self.after / self.noise)
+
+    @property
+    def at_noise(self) -> bool:
+        """Whether what the better model leaves counts as noise alone."""
+        return self.rms <= AT_NOISE
+
+
+def of_rms(before: float, after: float, noise: float = 1.0) -> Gap:
+    """Return the gap between two root mean square residuals, by default in noise standard deviations."""
+    return Gap(before**2, after**2, noise**2)
+
+
+def of_one(squared: float, noise: float = 1.0) -> Gap:
+    """Return the gap that one model leaves."""
+    return Gap(squared, squared, noise)
+
+
+def above_noise(rms: ArrayLike, noise: ArrayLike) -> NDArray[np.float64]:
+    """Root mean square errors without the noise's part; all in one unit."""
+    return np.asarray(np.sqrt(np.maximum(np.square(rms) - np.square(noise), 0.0)))
 
 
 def leave_one_out(group: NDArray[np.int64]) -> Array:
@@ -49,7 +119,7 @@ def covariance(replicates: Array) -> Array:
 
 
 def error(replicates: Array) -> Array:
-    """Standard errors `[...]` from replicates `[G, ...]`, each without one condition."""
+    """Return standard errors `[...]` from replicates `[G, ...]`, each without one condition."""
     g = len(replicates)
     return np.asarray(np.sqrt((g - 1) / g * np.sum((replicates - replicates.mean(0)) ** 2, axis=0)))
 
@@ -68,7 +138,7 @@ def interval(value: float, replicates: Array) -> tuple[float, float]:
 
 
 def mixture_quantiles(weight: Array, mean: Array, sd: Array, ends: Sequence[float]) -> Array:
-    """`[ends, k]`, of mixtures of Gaussians, by bisection of their distribution functions.
+    """Return `[ends, k]`, of mixtures of Gaussians, by bisection of their distribution functions.
 
     Args:
         weight: `[m]`, adding up to 1; mean, sd: `[m, k]`; ends: probabilities below.
@@ -118,14 +188,7 @@ def normal_deviate(x: Array, group: NDArray[np.int64]) -> float:
         return 0.0
     t = float(np.mean(x)) / (float(error(rows @ x / rows.sum(1))) + 1e-12)
     beyond = float(stats.t.logsf(abs(t), freedom(len(x) - rows.sum(1))))
-    return float(np.copysign(_normal_quantile(beyond), t))
-
-
-def _normal_quantile(log_beyond: float) -> float:
-    """The normal deviate that is exceeded with a probability given by its logarithm, up to 1/2."""
-    from scipy.special import ndtri_exp
-
-    return float(-ndtri_exp(min(log_beyond, np.log(0.5))))
+    return float(np.copysign(-ndtri_exp(min(beyond, np.log(0.5))), t))
 
 
 def variance_parts(squares: Array, kinds: Array, rounds: int = 4) -> tuple[Array, Array]:

@@ -60,12 +60,12 @@ def pictures(d: Diagnosis) -> dict[str, Any]:
 
 
 def _main(d: Diagnosis) -> dict[str, Any]:
-    """The stages of the windows' horizon, with what their floor comes from."""
+    """Return the stages of the windows' horizon, with what their floor comes from."""
     return stages_of(d) | {"floor": "repeats" if repeated(d) else "noise"}
 
 
 def waterfall(level: Mapping[str, float], stages: Mapping[str, Any]) -> Any:
-    """The squared gap from the delivered simulator down to the noise; roots over the stages."""
+    """Draw the squared gap from the delivered simulator down to the noise; roots over the stages."""
     figure = new_figure(8.0, 3.6, layout="constrained")
     axes = figure.subplots()
     bars = [("as delivered", 0.0, level["nominal"], "nominal", number(stages["nominal"]))]

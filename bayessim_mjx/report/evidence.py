@@ -33,7 +33,7 @@ def overlays(d: Diagnosis) -> dict[str, Any]:
 
 
 def _told(d: Diagnosis, row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of motion or gaps without what is not there: no effects, nothing simulated with them."""
+    """Return a row of motion or gaps; without effects nothing that was simulated with them."""
     return {k: v for k, v in row.items() if k != "with_effects" or d.effects}
 
 
@@ -84,7 +84,7 @@ def isolability(d: Diagnosis) -> dict[str, Any]:
 
 
 def flexible(d: Diagnosis) -> dict[str, Any]:
-    """The flexible residual force: how much better than the named effects it is, on what it depends, where."""
+    """Return the flexible residual force: how much better than the named effects, its inputs and its places."""
     found = d.details.get("flexible") or {}
     if not found:
         return {}
@@ -106,7 +106,7 @@ def flexible(d: Diagnosis) -> dict[str, Any]:
 
 
 def black_boxes(d: Diagnosis) -> dict[str, Any]:
-    """What a network and a formula close of the gap, beside the named effects."""
+    """Return the shares that a network and a formula close of the gap, beside the named effects."""
     found = d.details.get("black_boxes") or {}
     names = {"named_effects": "the named effects", "network": "a small network", "formula": "a sparse formula"}
     shares = [(text, found.get(key)) for key, text in names.items()]
@@ -115,7 +115,7 @@ def black_boxes(d: Diagnosis) -> dict[str, Any]:
 
 
 def experiment(d: Diagnosis) -> dict[str, Any]:
-    """The next experiment, its command, and the menu with the expected evidence."""
+    """Return the next experiment, its command, and the menu with the expected evidence."""
     plan, menu = d.next_experiment, d.details.get("experiments") or []
     own = next((e for e in menu if e.get("name") == plan.get("name")), None) or {}
     command = own.get("command") or {}
@@ -145,7 +145,7 @@ def data(d: Diagnosis) -> dict[str, Any]:
 
 
 def cell(value: Any) -> dict[str, Any]:
-    """A table's cell: text, and whether it is a number (set to the right)."""
+    """Return a table's cell: text, and whether it is a number (set to the right)."""
     if isinstance(value, Mapping):
         return {"text": "; ".join(f"{k} {cell(v)['text']}" for k, v in value.items()), "number": False}
     if isinstance(value, list | tuple):

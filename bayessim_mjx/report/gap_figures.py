@@ -59,7 +59,7 @@ def falls(level: Mapping[str, float]) -> list[str]:
 
 
 def part_words(stage: str, level: Mapping[str, float], floor: str = "") -> str:
-    """What is between a stage and the one before."""
+    """Name the part between a stage and the one before."""
     return FLOORS[floor] if stage == "noise_floor" and "reducible_floor" in level else PARTS[stage]
 
 
@@ -211,7 +211,7 @@ def _step(words: str, stage: str, top: float, end: float) -> dict[str, Any]:
 
 
 def _effects(shares: Sequence[Mapping[str, Any]], level: Mapping[str, float]) -> list[dict[str, Any]]:
-    """The effects' part split by their shares of it, or in one piece."""
+    """Return the effects' part split by their shares of it, or in one piece."""
     known = [s for s in shares if finite(s.get("share"))]
     total, whole = sum(s["share"] for s in known), level["calibrated"] - level["with_effects"]
     if not 1 <= len(known) <= 6 or total <= 0:

@@ -22,6 +22,16 @@ STAGE = {
     "noise_floor": "#A6ACB2",
     "measured": "#000000",
 }
+_REPAIRED = ("blue", "#005f96")
+TONES = {  # verdict: (colour on the terminal, on the page)
+    "no_gap": ("green", "#00755a"),
+    "parameters": _REPAIRED,
+    "noise": _REPAIRED,
+    "effects": _REPAIRED,
+    "ambiguous": ("yellow", "#8a5a00"),
+    "unexplained": ("red", "#b14a00"),
+    "insufficient_data": ("white", "#5b6670"),
+}
 DASH = {"nominal": "dot", "calibrated": "dash", "with_effects": "solid", "measured": "solid"}
 HATCH = {"nominal": "", "calibrated": "", "with_effects": "", "reducible_floor": "/", "noise_floor": "."}
 OVER = {"fillmode": "overlay", "fgcolor": "white", "size": 6}  # hatching over the colour
@@ -32,7 +42,7 @@ LEAST = 560  # px, of most figures on a narrow one
 
 
 def text(value: Any, length: int = 60) -> str:
-    """A string for plotly, which reads some HTML: shortened and escaped."""
+    """Return a string for plotly, which reads some HTML: shortened and escaped."""
     plain = str(value)
     plain = plain if len(plain) <= length else plain[: length - 1] + "…"
     return html.escape(plain, quote=False)
@@ -49,7 +59,7 @@ def numbers(values: Any, digits: int = 5) -> list[float | None]:
 
 
 def axis(title: str = "", **more: Any) -> dict[str, Any]:
-    """An axis with faint grid lines; `more` are plotly's own settings."""
+    """Return an axis with faint grid lines; `more` are plotly's own settings."""
     base = {
         "showgrid": True,
         "gridcolor": GRID,
@@ -66,7 +76,7 @@ def axis(title: str = "", **more: Any) -> dict[str, Any]:
 
 
 def figure(data: list[dict], width: int, height: int, *, least: int = LEAST, **layout: Any) -> dict[str, Any]:
-    """{"data", "layout", "width", "height", "least"} of one figure, without plotly's own colours, title or legend box.
+    """Make {"data", "layout", "width", "height", "least"} of a figure, without plotly's own colours, title or legend.
 
     least: px, the width below which it cannot be read; narrower screens scroll.
     """
@@ -102,19 +112,19 @@ def log_ticks(values: Sequence[Any]) -> list[float]:
 
 
 def log_axis(title: str, values: Sequence[Any], **more: Any) -> dict[str, Any]:
-    """A logarithmic axis whose ticks are whole numbers that people read, without plotly's small 2s and 5s."""
+    """Return a logarithmic axis whose ticks are whole numbers that people read, without plotly's small 2s and 5s."""
     ticks = log_ticks(values)
     return axis(title, type="log", tickvals=ticks, ticktext=[f"{t:g}" for t in ticks], **more)
 
 
 def note(words: str, x: float, y: float, **more: Any) -> dict[str, Any]:
-    """An annotation without an arrow; in fractions of the figure unless `xref`, `yref` say otherwise."""
+    """Return an annotation without an arrow; in fractions of the figure unless `xref`, `yref` say otherwise."""
     base = {"text": words, "x": x, "y": y, "xref": "paper", "yref": "paper", "showarrow": False, "font": {"size": 12}}
     return base | more
 
 
 def heading(words: str, x_axis: str, y_axis: str) -> dict[str, Any]:
-    """A panel's title, left above the panel of these axes (`x2`, `y2` ...)."""
+    """Return a panel's title, left above the panel of these axes (`x2`, `y2` ...)."""
     style = {"xanchor": "left", "yanchor": "bottom", "yshift": 4, "font": {"size": 12.5, "weight": 600}}
     return note(words, 0, 1, xref=f"{x_axis} domain", yref=f"{y_axis} domain", **style)
 

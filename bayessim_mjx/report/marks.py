@@ -12,7 +12,7 @@ WIDTH, HEIGHT, PAD = 190, 18, 6
 
 
 def scale_of(values: Sequence[Any], zero: bool = True) -> tuple[float, float]:
-    """Common limits of what is drawn, a little wider; with 0 inside where asked for."""
+    """Return common limits of what is drawn, a little wider; with 0 inside where asked for."""
     known = [float(v) for v in values if finite(v)] + ([0.0] if zero else [])
     low, high = min(known, default=0.0), max(known, default=1.0)
     room = 0.03 * (high - low) or 0.5 * abs(high) or 0.5
@@ -29,7 +29,7 @@ def interval(
     inner: Sequence[Any] | None = None,
     width: int = WIDTH,
 ) -> Markup:
-    """A dot at `value`, a line over `ci`, a thick one over `inner`, uprights at `ticks`, a hollow dot at `hollow`."""
+    """Draw a dot at `value`, a line over `ci`, a thick one over `inner`, ticks at `ticks`, a hollow dot at `hollow`."""
 
     def at(x: Any) -> float:
         share = (float(x) - limits[0]) / (limits[1] - limits[0])
@@ -50,7 +50,7 @@ def interval(
 
 
 def bar(share: Any, ci: Sequence[Any] | None, colour: str, width: int = WIDTH) -> Markup:
-    """A bar from 0 to `share` of 1 with its interval as a line."""
+    """Draw a bar from 0 to `share` of 1 with its interval as a line."""
     full = width - 2 * PAD
 
     def at(x: Any) -> float:

@@ -25,7 +25,7 @@ from bayessim_mjx.report.words import STAGES
 
 
 def _condition(row: Mapping[str, Any]) -> str:
-    """The log's operating condition, where that is not the log itself."""
+    """Return the log's operating condition, where that is not the log itself."""
     condition = row.get("condition")
     known = condition and condition != row.get("log")
     return f" <span style='color:{FAINT}'>{text(condition, 24)}</span>" if known else ""
@@ -124,7 +124,7 @@ def _lines(stages: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def _starts(row: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """A thin line at the start of each window."""
+    """Draw a thin line at the start of each window."""
     line = {"color": "#d5dade", "width": 1}
     style = {"type": "line", "y0": 0, "y1": 1, "xref": "x", "yref": "paper", "layer": "below", "line": line}
     return [style | {"x0": s, "x1": s} for s in (row.get("starts") or []) if finite(s)]
@@ -135,7 +135,7 @@ def _series(values: Sequence[Any]) -> np.ndarray:
 
 
 def commands(command: Mapping[str, Any]) -> dict[str, Any]:
-    """The command of an experiment: one row per actuator, up to eight."""
+    """Draw the command of an experiment: one row per actuator, up to eight."""
     rows = list(command["ctrl"].items())[:8]
     data, titles = [], []
     layout: dict[str, Any] = {}

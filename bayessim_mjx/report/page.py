@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.report import evidence, sections
-from bayessim_mjx.report.look import COLUMN, STAGE, WIDTH
+from bayessim_mjx.report.look import COLUMN, STAGE, TONES, WIDTH
 from bayessim_mjx.report.words import STAGES, not_fitted, page
 
 TEMPLATE = "template.html.j2"
@@ -27,7 +27,7 @@ def write(diagnosis: Diagnosis, folder: str | Path, missed: Any = None) -> Path:
 
 
 def render(d: Diagnosis, missed: Any = None, link: str = "", folder: Path = Path()) -> str:
-    """The page as text; `link`: to the page of the blind check, from where this one lies; `folder`: of the result."""
+    """Return the page as text; `link`: to the page of the blind check, from this one; `folder`: of the result."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
 
@@ -46,6 +46,7 @@ def render(d: Diagnosis, missed: Any = None, link: str = "", folder: Path = Path
         stage_names=STAGES,
         stage_colours=STAGE,
         verdict=d.verdict,
+        tone=TONES[d.verdict][1],
         top=sections.top(d, folder),
         about=sections.about(d),
         gap=sections.how_far(d),

@@ -180,7 +180,7 @@ def _hidden(hide: Sequence[float | None]) -> dict[str, Any]:
 
 
 def importance(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What the flexible residual force depends on, the most important input on top."""
+    """Draw the inputs of the flexible residual force, the most important one on top."""
     ranked = sorted((r for r in rows if finite(r.get("importance"))), key=lambda r: r["importance"])
     bars = {
         "type": "bar",

@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx.diagnosis.gap import of_one
 from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
-from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, label_title, titled
+from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.verdict import number as noise_sd
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
+from bayessim_mjx.diagnosis.statistics import of_one
 from bayessim_mjx.quantities import count, finite
 from bayessim_mjx.report import gap_figures, marks, place_figures
 from bayessim_mjx.report.choice import choice
@@ -32,6 +32,7 @@ from bayessim_mjx.report.words import (
 
 MOST_CANDIDATES = 20  # in the table; no source: a matter of style
 OPEN_WARNINGS = 3  # more are folded away; no source: a matter of style
+EFFECTS = STAGE["with_effects"]
 TILES = {
     "nominal": "as delivered",
     "calibrated": "after recalibration",
@@ -40,7 +41,7 @@ TILES = {
 
 
 def top(d: Diagnosis, folder: Path) -> dict[str, Any]:
-    """The first screen: verdict, effects with places and numbers, three gaps, a command, warnings."""
+    """Return the first screen: verdict, effects with places and numbers, three gaps, a command, warnings."""
     verdict, stages = verdict_of(d), stages_of(d)
     shown = [s for s in TILES if s in stages_told(d) and finite(stages[s])]
     return {
@@ -57,7 +58,7 @@ def top(d: Diagnosis, folder: Path) -> dict[str, Any]:
 
 
 def _tile(d: Diagnosis, stage: str) -> dict[str, str]:
-    """A stage's gap: of one joint in its unit, of several as a share of the motion; noise sd below."""
+    """Return a stage's gap: of one joint in its unit, of several as a share of the motion; noise sd below."""
     level = getattr(d.gap, stage)
     noises = f"{noise_sd(level)} noise sd" + ", within the noise" * of_one(level**2).at_noise
     rows = [r for r in d.gap.physical.values() if finite(r.get(stage))]
@@ -71,7 +72,7 @@ def _tile(d: Diagnosis, stage: str) -> dict[str, str]:
 
 
 def about(d: Diagnosis) -> list[str]:
-    """What was diagnosed, from what, and when: short phrases."""
+    """Return robot, logs and date in short phrases."""
     a = d.about
     data = [str(p) for p in a.get("data") or []]
     where_ = f" in {', '.join(data[:3])}" + (f" and {len(data) - 3} more" if len(data) > 3 else "") if data else ""
@@ -84,16 +85,11 @@ def about(d: Diagnosis) -> list[str]:
     ]
 
 
-def shares_of(d: Diagnosis) -> list[dict[str, Any]]:
-    """Shapley shares [{"effect", "share", "low", "high"}]: from the details, else from the effects."""
-    listed = d.details.get("shapley") or []
-    own = [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in d.effects if finite(e.share)]
-    return list(listed) or own
-
-
 def how_far(d: Diagnosis) -> dict[str, Any]:
     """Waterfalls per horizon, the horizons side by side, shares, predicted against realised, and tables."""
-    stages, shares = stages_of(d), shares_of(d)
+    stages = stages_of(d)
+    shared = [e for e in d.effects if finite(e.share)]
+    shares = [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in shared]
     rows: list[dict[str, Any]] = [{"name": "overall", **stages}]
     same = [h for h in d.gap.horizons if all(h.get(s) == stages[s] for s in ("nominal", "with_effects"))]
     rows = list(d.gap.horizons) if same else rows + list(d.gap.horizons)
@@ -107,8 +103,15 @@ def how_far(d: Diagnosis) -> dict[str, Any]:
         "repeated": repeated(d),
         "several": len(d.gap.physical) != 1 and bool(d.gap.shares),
         "beyond": bool(d.gap.beyond),
-        "shapley": _shapley(d.details.get("shapley") or [] if d.effects else []),
-        "closure": _closure(d.details.get("closure") or [] if d.effects else []),
+        "shapley": [
+            {
+                "name": capital(titled(e.name, e.where)),
+                "share": percent(e.share),
+                "mark": marks.bar(e.share, None, EFFECTS),
+            }
+            for e in shared
+        ],
+        "closure": _closure(d),
         "unit": d.gap.unit,
     }
 
@@ -132,7 +135,7 @@ def _table(d: Diagnosis, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {"rows": rows, "stages": known, "closed": any(r["closed"] != MISSING for r in rows), "heads": MORE}
 
 
-MORE = ("largest that is left", "tolerance", "range of motion", "noise")
+MORE = ("largest error", "tolerance", "range of motion", "noise")
 
 
 def _channels(d: Diagnosis) -> list[dict[str, Any]]:
@@ -148,30 +151,22 @@ def _channels(d: Diagnosis) -> list[dict[str, Any]]:
     return rows
 
 
-def _shapley(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": label_title(r["effect"]),
-            "share": percent(r.get("share")),
-            "between": between(r.get("low"), r.get("high")),
-            "mark": marks.bar(r.get("share"), (r.get("low"), r.get("high")), STAGE["with_effects"]),
-        }
-        for r in rows
+def _closure(d: Diagnosis) -> list[dict[str, Any]]:
+    """Tabulate the shares closed as predicted and as realised, of each effect and of all together."""
+    own = [f"{e.name}@{e.where}" for e in d.effects]
+    rows: list[tuple[Any, ...]] = [
+        ([n], e.predicted_gap_closed, e.gap_closed, e.gap_closed_ci) for n, e in zip(own, d.effects, strict=True)
     ]
-
-
-def _closure(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    limits = marks.scale_of([r.get(k) for r in rows for k in ("predicted", "realised")] + [1.0])
+    rows += [(own, *(d.gap.closed.get(k) for k in ("predicted", "realised", "ci")))] if len(own) > 1 else []
+    limits = marks.scale_of([share for _, predicted, realised, _ in rows for share in (predicted, realised)] + [1.0])
     return [
         {
-            "name": candidate_title(r),
-            "predicted": percent(r.get("predicted")),
-            "realised": percent(r.get("realised")),
-            "mark": marks.interval(
-                r.get("realised"), r.get("ci"), limits, STAGE["with_effects"], hollow=r.get("predicted")
-            ),
+            "name": candidate_title({"effects": names}),
+            "predicted": percent(predicted),
+            "realised": percent(realised),
+            "mark": marks.interval(realised, ci, limits, EFFECTS, hollow=predicted),
         }
-        for r in rows
+        for names, predicted, realised, ci in rows
     ]
 
 
@@ -189,7 +184,7 @@ def _effect(e: FoundEffect) -> dict[str, Any]:
         "weight": percent(e.weight_among_rivals) if finite(e.weight_among_rivals) else "",
         "closed": percent(e.gap_closed),
         "ci": between(*e.gap_closed_ci),
-        "mark": marks.bar(e.gap_closed, e.gap_closed_ci, STAGE["with_effects"]),
+        "mark": marks.bar(e.gap_closed, e.gap_closed_ci, EFFECTS),
         "weight_mark": marks.bar(e.weight_among_rivals, None, "#9aa3ab") if finite(e.weight_among_rivals) else "",
         "predicted": percent(e.predicted_gap_closed) if finite(e.predicted_gap_closed) else "",
         "share": percent(e.share) if finite(e.share) else "",
@@ -206,7 +201,7 @@ def _effect(e: FoundEffect) -> dict[str, Any]:
 
 
 def candidates(d: Diagnosis) -> dict[str, Any]:
-    """The best of the ranking, scores with one and two standard errors on a scale that all rows share."""
+    """Return the best of the ranking, scores with one and two standard errors on a scale that all rows share."""
     shown = d.candidates[:MOST_CANDIDATES]
     reach = [c["score"] + k * (c.get("se") or 0.0) for c in shown if finite(c.get("score")) for k in (-2, 2)]
     limits = marks.scale_of(reach, zero=True)
@@ -216,7 +211,7 @@ def candidates(d: Diagnosis) -> dict[str, Any]:
         score, se = c.get("score"), c.get("se") or 0.0
         spans = [(score - m * se, score + m * se) for m in (2, 1)] if finite(score) and finite(se) else [None, None]
         chosen = set(c.get("effects") or []) == confirmed and bool(confirmed)
-        colour = STAGE["with_effects"] if chosen else "#5b6670"
+        colour = EFFECTS if chosen else "#5b6670"
         rows.append(
             {
                 "rank": k,
@@ -234,7 +229,7 @@ def candidates(d: Diagnosis) -> dict[str, Any]:
 
 
 def _own(candidate: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of the candidate's own parameters: `<where>.<effect>.<parameter>`, or those without a place."""
+    """Return the values of the candidate's own parameters: `<where>.<effect>.<parameter>`, or those without a place."""
     labels = [str(x).partition("@") for x in candidate.get("effects") or []]
     heads = tuple(f"{where}.{name}." for name, _, where in labels)
     values = candidate.get("parameters") or {}
@@ -277,7 +272,7 @@ def where(d: Diagnosis) -> dict[str, Any]:
 
 
 def _link(x: Mapping[str, Any]) -> dict[str, Any]:
-    """A link of the chain; its verdict without the name and the numbers that stand beside it."""
+    """Return a link of the chain; its verdict without the name and the numbers that stand beside it."""
     head, _, rest = (words := str(x.get("verdict") or "")).partition(": ")
     words = (rest if "->" in head and rest else words).rpartition(" (corr ")[0] or (rest if "->" in head else words)
     return {

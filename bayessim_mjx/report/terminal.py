@@ -11,20 +11,12 @@ from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.tables import TIE
 from bayessim_mjx.quantities import finite
+from bayessim_mjx.report.look import TONES
 from bayessim_mjx.report.words import MISSING, between, closure, estimate, not_fitted, number, percent, quantity
 
 BEST = 8  # candidates; no source: a matter of style
 NOT_FITTED = 6  # named for each reason; diagnosis.json has all; no source: a matter of style
 Table = tuple[list[str], list[list[str]], tuple[int, ...]]  # header, rows, columns of words
-COLOURS = {
-    "no_gap": "green",
-    "parameters": "blue",
-    "noise": "blue",
-    "effects": "blue",
-    "ambiguous": "yellow",
-    "unexplained": "red",
-    "insufficient_data": "white",
-}
 FILES = ("report.html", "diagnosis.json", "effects.yaml", "model_with_effects.xml")
 
 
@@ -39,7 +31,7 @@ def console(
         headless: no control characters, as where there is no terminal.
     """
     with Console(file=file, headless=headless) as out:
-        out.panel(verdict_of(diagnosis).badge, _first(diagnosis), COLOURS[diagnosis.verdict])
+        out.panel(verdict_of(diagnosis).badge, _first(diagnosis), TONES[diagnosis.verdict][0])
         if folder is not None and (text := command(diagnosis, folder)):
             out.command("next", text)
         for warning in diagnosis.warnings:
@@ -96,14 +88,14 @@ def _effects(d: Diagnosis) -> Table:
 
 
 def _rivals(e: FoundEffect) -> str:
-    """The effect's relative score and then its rivals with theirs, where they have one; nothing where there is none."""
+    """Return the effect's relative score, then its rivals with theirs, where they have one; "" without rivals."""
     shares = [percent(e.weight_among_rivals)] if finite(e.weight_among_rivals) else []
     rivals = [(candidate_title(r), r.get("weight")) for r in e.equivalent_to]
     return "; ".join([*shares, *(f"{name} {percent(weight)}" if finite(weight) else name for name, weight in rivals)])
 
 
 def _parameters(d: Diagnosis) -> Table:
-    """What the simulator's own parameters become, where that is the whole answer."""
+    """Tabulate the simulator's own parameters, where they are the whole answer."""
     rows = [
         [name, number(p.get("nominal")), estimate(p.get("mean"), p.get("sd"), p.get("unit") or "")]
         for name, p in d.parameters.items()

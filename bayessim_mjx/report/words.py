@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from bayessim_mjx import quantities
-from bayessim_mjx.diagnosis.gap import of_rms
 from bayessim_mjx.diagnosis.phrases.effects import label_title, measured
 from bayessim_mjx.diagnosis.phrases.effects import quantity as _quantity
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate
+from bayessim_mjx.diagnosis.statistics import of_rms
 from bayessim_mjx.quantities import finite, typeset
 
 MISSING = quantities.MISSING  # where there is no number
@@ -26,18 +26,18 @@ STAGES = {
 
 
 def signs(text: Any) -> str:
-    """A sentence with `±`, minus signs and superscripts in place of ASCII."""
+    """Return a sentence with `±`, minus signs and superscripts in place of ASCII."""
     text = re.sub(r"\^(-?\d+)", lambda power: power[1].translate(quantities.SUPERSCRIPT), str(text))
     return re.sub(r"(?<![\w.-])-(?=\d)", "−", text.replace(" +- ", " ± "))
 
 
 def page(text: Any) -> str:
-    """A sentence as it is printed on a page: with `signs`, and no line break between a number and its unit."""
+    """Return a sentence as it is printed on a page: with `signs`, and no line break between a number and its unit."""
     return re.sub(UNITS, lambda tied: tied[0].replace(" ", "\N{NO-BREAK SPACE}"), signs(text))
 
 
 def stages_told(d: Diagnosis) -> dict[str, str]:
-    """The stages that exist: none with effects where there are none, no floor where nothing repeats."""
+    """Return the stages that exist: none with effects where there are none, no floor where nothing repeats."""
     left_out = {"with_effects": not d.effects, "reducible_floor": not repeated(d)}
     return {s: words for s, words in STAGES.items() if not left_out.get(s)}
 
@@ -48,12 +48,12 @@ def repeated(d: Diagnosis) -> bool:
 
 
 def length(value: Any, in_unit: str) -> str:
-    """An error in degrees, millimetres or metres, see `quantities.extent`."""
+    """Return an error in degrees, millimetres or metres, see `quantities.extent`."""
     return typeset(quantities.extent(value, in_unit)) if finite(value) else MISSING
 
 
 def closure(share: Any) -> str:
-    """A share of the gap closed; a model that widens it closes none."""
+    """Return a share of the gap closed; a model that widens it closes none."""
     return "none, it is worse" if finite(share) and share < -0.0005 else percent(share)
 
 
@@ -63,7 +63,7 @@ def known_span(span: Any) -> tuple[float, float] | None:
 
 
 def spanned(span: Any) -> str:
-    """The ends of an interval of a gap in brackets; one without information is called wide."""
+    """Return the ends of an interval of a gap in brackets; one without information is called wide."""
     span = known_span(span)
     if span is None:
         return ""
@@ -87,7 +87,7 @@ def estimate(mean: Any, sd: Any = math.nan, in_unit: str = "") -> str:
 
 
 def quantity(name: str, value: Estimate) -> tuple[str, str]:
-    """A parameter's name and value, see `phrases.effects.quantity`."""
+    """Return a parameter's name and value, see `phrases.effects.quantity`."""
     title, text = _quantity(name, value)
     return title, signs(text)
 

@@ -163,7 +163,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         "limit = excess[key] +", "limit = 0.0 * excess[key] - 1.0 +", (SETS,),
     ),
     (
-        "noise is not taken out before the tolerance", f"{P}/diagnosis/tolerance.py",
+        "noise is not taken out before the tolerance", f"{P}/diagnosis/statistics.py",
         "np.asarray(np.sqrt(np.maximum(np.square(rms) - np.square(noise), 0.0)))", "np.asarray(np.abs(rms))",
         ("tests/diagnosis/test_tolerance.py", "-k", "taken_out"),
     ),

@@ -24,10 +24,10 @@ def test_a_planted_number_is_in_everything_that_is_derived_from_it():
     """The median of the missing force is the root of its least amplitude; words read the new limit of noise."""
     code = (
         "import sys; sys.path[:0] = [sys.argv[1]]; import sensitivity\n"
-        "sensitivity.plant('Priors.least', 1e-6); sensitivity.plant('gap:AT_NOISE', 7.0)\n"
+        "sensitivity.plant('Priors.least', 1e-6); sensitivity.plant('statistics:AT_NOISE', 7.0)\n"
         "from bayessim_mjx.diagnosis.evidence import gaussian\n"
-        "from bayessim_mjx.diagnosis import gap\n"
-        "print(gaussian.PRIORS.least, round(gaussian.PRIORS.usual, 9), gap.Gap(2.0, 36.0).at_noise)\n"
+        "from bayessim_mjx.diagnosis import statistics\n"
+        "print(gaussian.PRIORS.least, round(gaussian.PRIORS.usual, 9), statistics.Gap(2.0, 36.0).at_noise)\n"
         "try: sensitivity.plant('Priors.noise', 1.0)\n"
         "except RuntimeError as e: print(e)"
     )

@@ -2,6 +2,7 @@
 
 import ast
 import errno
+import os
 import re
 import runpy
 import shlex
@@ -213,6 +214,15 @@ def test_only_what_the_user_can_mend_is_one_line(capsys: pytest.CaptureFixture) 
     for bug in (ValueError("math domain error"), FloatingPointError("x"), KeyError("k"), SystemExit("bye")):
         code, err = ends(bug)
         assert code == 1 and "Traceback" in err and "please report it" in err.splitlines()[-1]
+
+
+def test_an_opengl_library_that_cannot_be_loaded_is_named_with_those_that_are_allowed() -> None:
+    """MuJoCo fails when it is imported; a process of its own, as this one has imported it."""
+    code = "import sys; from bayessim_mjx import cli; sys.exit(cli.command(lambda argv: __import__('mujoco'))([]))"
+    bogus = os.environ | {"MUJOCO_GL": "bogus"}
+    ended = subprocess.run([sys.executable, "-c", code], env=bogus, capture_output=True, text=True)
+    assert ended.returncode == 2 and ended.stderr.startswith("error: MUJOCO_GL=bogus: OpenGL cannot be loaded; allowed")
+    assert "osmesa" in ended.stderr and ended.stderr.count("\n") == 1
 
 
 def test_a_path_that_no_system_takes_is_one_line(capsys: pytest.CaptureFixture) -> None:

@@ -75,7 +75,7 @@ def test_effects_carry_the_estimates_in_the_librarys_order():
         ("coulomb_friction", "level", 3.0, 0.5, 0.0, 5.0),  # the library ends at 1
         ("actuator_gain", "gain", 0.3, 0.2, 0.15, 1.5),  # never negative
         ("joint_offset", "offset", -0.2, 0.01, -0.24, 0.1),
-        ("coulomb_friction", "level", 0.5, math.nan, 0.0, 1.5),  # an sd that is not known: half the value
+        ("coulomb_friction", "level", 0.5, math.nan, 0.0, 0.5 + 4 * 1 / 12**0.5),  # sd not known: uniform up to 1
     ],
 )
 def test_ranges_hold_the_estimate_and_stay_physical(name, quantity, mean, sd, low, high):

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from bayessim_mjx.diagnosis.gap import AT_NOISE, Gap, of_one, of_rms
+from bayessim_mjx.diagnosis.statistics import AT_NOISE, Gap, of_one, of_rms
 
 
 @pytest.mark.parametrize(

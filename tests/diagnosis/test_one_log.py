@@ -24,6 +24,6 @@ def test_one_log_is_one_condition_and_in_sample(tmp_path):
     text = " ".join(said["sentences"])
     assert "in sample" in text and "parts of the log" in text and "condition that" not in text
     assert any("one log is one operating condition" in w and "in sample" in w for w in said["warnings"])
-    assert any("over whole logs, 1 of 1 are simulated with parameters that were fitted" in w for w in said["warnings"])
+    assert any("1 of 1 whole logs are simulated with parameters fitted to them" in w for w in said["warnings"])
     assert said["gap"]["horizons"][-1]["in_sample"] == 1
     assert all(c["se"] is None for c in said["candidates"])

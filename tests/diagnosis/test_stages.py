@@ -6,9 +6,8 @@ from types import MappingProxyType
 
 import pytest
 
-from bayessim_mjx.diagnosis.findings import Findings, Observer
+from bayessim_mjx.diagnosis.findings import Findings, Observer, Stage, carry_out
 from bayessim_mjx.diagnosis.selection.budget import Budget
-from bayessim_mjx.diagnosis.stages import Stage, carry_out
 
 
 class First:

@@ -7,16 +7,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis import tolerance
+from bayessim_mjx.diagnosis import request
 from bayessim_mjx.diagnosis.evidence.force_left import ForceLeft
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
+from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.diagnosis.residual.origin import Origin
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.summary import how_far, verdict
-from bayessim_mjx.diagnosis.summary.whole_logs import Whole
+from bayessim_mjx.diagnosis.summary.again import Whole
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Channels, Log
+from bayessim_mjx.quantities import extent
 from tests.diagnosis.phrases.cases import made
 
 MODEL = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
@@ -31,13 +33,13 @@ DEG = math.pi / 180
         ([], 0.02 * 2.0, 3 * 0.01),  # 2 % of 2 rad is more than 3 mrad; 3 noises of 10 mm are more than 2 % of 0.5 m
         (["hinge=0.5deg"], 0.5 * DEG, 0.03),
         (["5%"], 0.1, 0.025),
-        (["0.02"], 0.02, 0.02),
+        (["hinge=0.02rad", "rail=0.02 m"], 0.02, 0.02),
         (["hinge=10mrad,rail=4mm"], 0.01, 0.004),
         (["rail=1cm", "1%"], 0.02, 0.01),  # the joint's own goes before that of all
     ],
 )
 def test_what_is_typed_and_what_is_taken_without(texts, hinge, rail):
-    own = tolerance.judge(MODEL, np.array([2.0, 0.5]), np.array([0.001, 0.01]), tolerance.read(texts, MODEL))
+    own = request.tolerances(texts, MODEL)(np.array([2.0, 0.5]), np.array([0.001, 0.01]))
     assert own.limit == pytest.approx([hinge, rail]) and own.units == ("rad", "m")
 
 
@@ -45,32 +47,34 @@ def test_what_is_typed_and_what_is_taken_without(texts, hinge, rail):
     ("text", "words"),
     [
         ("elbow=1deg", "elbow"),
-        ("hinge=1mm", "deg"),
+        ("hinge=1mm", "hinge is in deg, mrad, rad or %, not in mm"),
+        ("5", "5 has no unit; allowed: a number above 0 with a unit: 5deg, 5mrad, 5rad or 5% of the range of motion"),
+        ("rail=5", "5 has no unit; allowed: a number above 0 with a unit: 5mm, 5cm, 5m or 5% of the range of motion"),
         ("2deg", "rail"),  # of all joints, one of which slides
         ("hinge=-1deg", "-1deg"),
         ("hinge=", "''"),
-        ("hinge=0", "not positive"),
+        ("hinge=0deg", "not above 0"),
         ("1.2.3", "1.2.3"),
         ("hinge=lots", "lots"),
-        ("hinge=1e999", "not positive"),
+        ("hinge=1e999deg", "not above 0"),
     ],
 )
 def test_what_cannot_be_read_is_refused_by_name(text, words):
     with pytest.raises(UserError, match=r"--tolerance") as told:
-        tolerance.read([text], MODEL)
+        request.tolerances([text], MODEL)
     assert words in str(told.value) and ("allowed" in str(told.value) or "there are: hinge, rail" in str(told.value))
 
 
 def test_noise_is_taken_out_before_the_rest_is_judged():
-    own = tolerance.judge(MODEL, np.array([1.0, 1.0]), np.array([0.01, 0.01]), {0: tolerance.Limit(0.02, False)})
+    own = request.judge(MODEL, {0: request.Limit(0.02, False)}, np.array([1.0, 1.0]), np.array([0.01, 0.01]))
     # sqrt(0.022^2 - 0.01^2) = 0.0196; sqrt(0.0325^2 - 0.01^2) = 0.0309 > 3 noises
     assert own.exceeded(np.array([0.022, 0.0325])).tolist() == [False, True]
     assert own.exceeded(np.array([0.023, 0.0310])).tolist() == [True, False]
 
 
 def test_a_tolerance_below_the_noise_is_told():
-    own = tolerance.judge(MODEL, np.ones(2), np.array([0.01, 0.01]), {0: tolerance.Limit(0.001, False)})
-    (text,) = own.warnings()
+    own = request.judge(MODEL, {0: request.Limit(0.001, False)}, np.ones(2), np.array([0.01, 0.01]))
+    (text,) = notes.below_noise(own)
     assert "hinge" in text and "noise" in text
     assert not own.exceeded(np.array([0.0141, 0.0])).any()  # what is left above the noise is the noise itself
 
@@ -81,7 +85,7 @@ def test_a_tolerance_below_the_noise_is_told():
      (0.0087 * DEG, "rad", "0.0087 deg"), (0.0, "m", "0.0 mm"), (180 * DEG, "rad", "180 deg")],
 )  # fmt: skip
 def test_physical_units(value, unit, text):
-    assert tolerance.extent(value, unit) == text
+    assert extent(value, unit) == text
 
 
 # The verdict
@@ -172,7 +176,7 @@ def test_effects_that_need_another_robot_do_not_explain_it(off, stated, bent):
 
 @pytest.mark.parametrize(
     ("rms", "beyond", "times"),
-    [(1.2, (6.0, 8.0, 700.0), 8**0.5), (1.2, (0.1, 4.0, 700.0), 0), (1.2, (), 0), (1.6, (6.0, 8.0, 700.0), 0)],
+    [(1.2, (6.0, 8.0, 700.0), 8**0.5), (1.2, (0.1, 3.6, 700.0), 0), (1.2, (), 0), (1.6, (6.0, 8.0, 700.0), 0)],
 )
 def test_what_windows_hide_is_told_of_whole_logs(rms, beyond, times):
     """By the median log, as an unstable one says little; where windows show the rest themselves that is told."""
@@ -182,12 +186,12 @@ def test_what_windows_hide_is_told_of_whole_logs(rms, beyond, times):
 
 def test_the_headline_says_partly_explained_and_what_remains_where():
     head, *rest = said("unexplained", [FRICTION], gap(0.0349))
-    assert head.startswith("Partly explained: the simulator lacks Coulomb friction at elbow; more than the tolerance")
+    assert head.startswith("Partly explained: the simulator lacks Coulomb friction at elbow. More than the tolerance")
     assert "elbow: 2.0 deg rms, 6.0 deg at most (3.5 % of its motion; tolerance 1.1 deg)" in head
     assert "shoulder" not in head and any(text.startswith("By joint") for text in rest)
     head, *rest = said("effects", [FRICTION], gap(0.0132))
     assert head == "The simulator lacks Coulomb friction at elbow."
-    assert rest[-1] == "Every joint is within its tolerance (closest: elbow, 0.76 deg above the noise, of 1.1 deg)."
+    assert rest[-1] == "Every joint is within its tolerance (closest: elbow, 0.76 deg of 1.1 deg, noise subtracted)."
 
 
 def test_what_no_effect_explains_is_told_against_the_tolerance_too():

@@ -126,15 +126,6 @@ def details(seed=0):
             }
             for k, log in enumerate([*logs, "drop_04.npz", "hold_05.npz", "prbs_06.npz"])
         ],
-        "shapley": [
-            {"effect": LABELS[0], "share": 0.71, "low": 0.62, "high": 0.79},
-            {"effect": LABELS[4], "share": 0.29, "low": 0.2, "high": 0.37},
-        ],
-        "closure": [
-            {"effects": [LABELS[0]], "predicted": 0.66, "realised": 0.63},
-            {"effects": [LABELS[4]], "predicted": 0.31, "realised": 0.27},
-            {"effects": [LABELS[0], LABELS[4]], "predicted": 0.97, "realised": 0.955},
-        ],
         "black_boxes": {
             "network": 0.87,
             "formula": -0.2,

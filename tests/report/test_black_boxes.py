@@ -21,11 +21,17 @@ def test_the_table_has_shares_and_the_formula():
     assert evidence.black_boxes(dataclasses.replace(d, details={})) == {}
 
 
-@pytest.mark.parametrize(("named", "end"), [(0.931, ", the named effects 93 %."), (float("nan"), ".")])
+@pytest.mark.parametrize(
+    ("named", "end"),
+    [
+        (0.931, ", a formula of 1 term nothing and the named effects 93 %."),
+        (float("nan"), " and a formula of 1 term nothing."),
+    ],
+)
 def test_one_sentence(named, end):
     (told,) = residual.black_boxes(BlackBoxes(0.874, -0.1, named, TERMS[:1], 4))
-    head = "Shares of the squared gap that are closed on held-out conditions: a small network without physics 87 %"
-    assert told == f"{head}, a formula of 1 term none{end}"
+    head = "On held-out conditions a small network without physics closes 87 % of the squared gap"
+    assert told == f"{head}{end}"
     assert residual.black_boxes(None) == []
 
 

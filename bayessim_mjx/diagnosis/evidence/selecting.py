@@ -20,14 +20,13 @@ from bayessim_mjx.diagnosis.evidence.weighing import Estimated, Size, Weighing, 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate, solve
-from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
 from bayessim_mjx.diagnosis.selection.fits import begin, cut_back
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings
 from bayessim_mjx.diagnosis.selection.successive_halving import Entries, fit_entries
-from bayessim_mjx.diagnosis.statistics import shapley
+from bayessim_mjx.diagnosis.statistics import Gap, shapley
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bayessim_mjx.diagnosis.result import Diagnosis
-from bayessim_mjx.diagnosis.verdicts import Verdict as Title
+from bayessim_mjx.diagnosis.result import Verdict as Title
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ REMAINDER = Verdict(
 
 
 def verdict_of(d: Diagnosis) -> Verdict:
-    """The verdict's words; a remainder beside named effects has its own."""
+    """Return the verdict's words; a remainder beside named effects has its own."""
     if d.verdict == "effects" and d.gap.beyond:
         return REMAINDER
     if d.verdict == "ambiguous" and d.next_experiment.get("name", "none") == "none":
@@ -87,12 +87,12 @@ def verdict_of(d: Diagnosis) -> Verdict:
 
 
 def headline(d: Diagnosis) -> str:
-    """The first sentence, or the verdict's own."""
+    """Return the first sentence, or the verdict's own."""
     return d.sentences[0] if d.sentences else verdict_of(d).headline
 
 
 def command(d: Diagnosis, folder: str | Path) -> str:
-    """A command to paste: training or viewing the corrected simulator, or the next diagnosis; "" if there is none."""
+    """Return a command to paste: train or view the corrected simulator, or the next diagnosis; "" if there is none."""
     model, data = str(d.about.get("model") or ""), [str(x) for x in d.about.get("data") or []]
     if not model or not data:
         return ""

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from scipy.special import ndtri
+
 from bayessim_mjx import effects as library
 from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.correction import Estimate, FoundEffect
+from bayessim_mjx.diagnosis.selection.numbers import ODDS
 from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import finite, listed, percent
 
@@ -27,13 +30,13 @@ RECIPROCALS = {
 }
 WRONG = "the true "  # begins the words for an effect whose number the simulator has, but not right
 MOST = 6  # things that a sentence lists: all joints of an arm; a rule of thumb
-# standard deviations from neutral, or from the data sheet: one normal number in 22 is further away by chance; false
-# reports of fitted values were not counted
-CLEAR = 2.0
+# standard deviations, 1.98: the odds of a normal number against so large a chance deviation are strong (`Odds.strong`);
+# false reports of fitted values were not counted
+CLEAR = -float(ndtri(0.5 / (1.0 + ODDS.strong)))
 
 
 def missing(name: str, where: str) -> str:
-    """`a command delay at torque`, after "the simulator lacks"."""
+    """Return `a command delay at torque`, after "the simulator lacks"."""
     own = words(name)
     return own.at(where, own.lacks)
 
@@ -44,7 +47,7 @@ def titled(name: str, where: str) -> str:
 
 
 def by_law(effects: Iterable[Sequence[str]]) -> list[str]:
-    """A phrase for each law, (name, place) given: `Coulomb friction at shoulder and elbow`."""
+    """Return a phrase for each law, (name, place) given: `Coulomb friction at shoulder and elbow`."""
     places: dict[str, list[str]] = {}
     for name, where in effects:
         places.setdefault(name, []).append(where)
@@ -86,7 +89,7 @@ def spanned(mean: float, low: float, high: float, unit: str) -> str:
 
 
 def quantity(name: str, value: Estimate) -> tuple[str, str]:
-    """A parameter's name and value; reciprocals turned over (`inverse_limit` 0.5 1/(N m) -> limit 2 N m)."""
+    """Return a parameter's name and value; reciprocals turned over (`inverse_limit` 0.5 1/(N m) -> limit 2 N m)."""
     if name in RECIPROCALS and finite(value.mean) and value.mean > 0:
         sd = value.sd / value.mean**2 if finite(value.sd) else value.sd  # d(1/x) = dx / x^2
         turned = {"at least": "at most", "at most": "at least"}.get(value.bound, value.bound)
@@ -95,7 +98,7 @@ def quantity(name: str, value: Estimate) -> tuple[str, str]:
 
 
 def _bounded(text: str, bound: str) -> str:
-    """A value that ends at a bound (`Estimate.bound`)."""
+    """Return a value that ends at a bound (`Estimate.bound`)."""
     if bound in ("at least", "at most"):
         return f"{bound} {text}"
     return text + {"off": " (off)", "end": " (end of its range)"}.get(bound, "")
@@ -108,7 +111,7 @@ def _turned(text: str) -> str:
 
 
 def numbered(effect: FoundEffect) -> str:
-    """An effect with its place and numbers, after "the simulator lacks": `a command delay of 12.1 +- 0.4 ms at motor`.
+    """Name an effect with its place and numbers: `a command delay of 12.1 +- 0.4 ms at motor`.
 
     Of several numbers those that are clearly away from neutral; the table has all.
     """
@@ -135,7 +138,7 @@ def _clear(effect: str, name: str, value: Estimate) -> bool:
 
 
 def wrong(effect: FoundEffect) -> str:
-    """`the actuator gain at torque is 0.698 +- 0.036, not 1`, of an effect that corrects a number; else ""."""
+    """Return `the actuator gain at torque is 0.698 +- 0.036, not 1`, of an effect that corrects a number; else ""."""
     kind, own = library.known(effect.name), words(effect.name)
     if kind is None or not own.lacks.startswith(WRONG):
         return ""
@@ -149,7 +152,7 @@ def wrong(effect: FoundEffect) -> str:
 
 
 def lacking(effects: Sequence[FoundEffect]) -> str:
-    """`the simulator lacks ...; the actuator gain at torque is ...`: each effect with its place and numbers."""
+    """Return `the simulator lacks ...; the actuator gain at torque is ...`: each effect with its place and numbers."""
     laws: dict[str, list[FoundEffect]] = {}
     for e in (e for e in effects if not wrong(e)):
         laws.setdefault(e.name if len(e.parameters) == 1 else f"{e.name}@{e.where}", []).append(e)
@@ -191,7 +194,7 @@ def answer(effect: FoundEffect, found: Mapping[str, Any]) -> str:
         size = spanned(number["mean"], number["low"], number["high"], number["unit"])
         rest = [title for title, m in zip(titles, each, strict=True) if m[1:] or m[0] not in number["effects"]]
         text = f"{size}{_way(number)}, by {any_of(number['effects'])}"
-        text += f"; or, with another number, {listed(rest, 'or')}" if rest else ""
+        text += f". With another number: {listed(rest, 'or')}" if rest else ""
     return f"These logs fit {len(each)} explanations alike: {text}."
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 from bayessim_mjx.effects.support.words import words
-from bayessim_mjx.quantities import listed
+from bayessim_mjx.quantities import percent
 
 
 def known_payload(mass: float, place: str) -> tuple[str, str]:
@@ -18,7 +18,7 @@ def known_payload(mass: float, place: str) -> tuple[str, str]:
 
 
 def other_mount(way: str) -> tuple[str, str]:
-    """The same of a base that is mounted another way."""
+    """Return the same of a base that is mounted another way."""
     return f"base {way}", f"a person: mount the base {way}"
 
 
@@ -45,7 +45,7 @@ def run_experiment(name: str, seconds: float) -> str:
 
 
 def sharpens(action: str, parameter: str, before: float, after: float) -> str:
-    """The gain in accuracy of a parameter, where no rival is left.
+    """Return the gain in accuracy of a parameter, where no rival is left.
 
     As a ratio: both are of noise alone, and so smaller than the standard deviation that the diagnosis reports.
     """
@@ -53,8 +53,11 @@ def sharpens(action: str, parameter: str, before: float, after: float) -> str:
 
 
 def sharpens_little(best: str, parameter: str, before: float, after: float) -> str:
-    """Why an experiment does not help, of its name and the parameter that it measures best."""
-    return f"no experiment of the menu adds much; the best, {sharpens(best, parameter, before, after)}"
+    """Say that no experiment helps; best: its name, with the parameter that it measures best."""
+    left = percent(after / before)
+    return (
+        f"no experiment of the menu adds much; the best, {best}, leaves {left} of the standard deviation of {parameter}"
+    )
 
 
 def separates_nobody(labels: Sequence[str], best: str, evidence: float, help: str) -> str:
@@ -64,7 +67,7 @@ def separates_nobody(labels: Sequence[str], best: str, evidence: float, help: st
 
 
 def tells_apart(action: str, labels: Sequence[str], evidence: float, contested: bool, decides: float) -> str:
-    """The models that an experiment separates; contested: whether the logs left it open; decides: nats that do."""
+    """Name the models that an experiment separates; contested: whether the logs left it open; decides: nats that do."""
     times = math.ceil(decides / max(evidence, 1e-9))
     again = f"; repeat it {times} times for a decision" if 1 < times <= decides else ""
     whom = f"separates {_apart(labels)}" if contested else f"confirms {_apart(labels, 'against')}"
@@ -72,4 +75,4 @@ def tells_apart(action: str, labels: Sequence[str], evidence: float, contested: 
 
 
 def _apart(labels: Sequence[str], word: str = "from") -> str:
-    return f"{labels[0]} {word} {listed(labels[1:])}"
+    return f"{labels[0]} {word} {', or '.join(labels[1:])}"  # labels may hold an "and"

@@ -11,8 +11,8 @@ from bayessim_mjx.quantities import listed
 STUCK = "At a bound: {named}. They stand in for something missing, or their ranges are too narrow."
 FAR = "Far from the data sheet: {named}."
 STANDS_FOR = (
-    "These logs do not separate a wrong data sheet at {parameters} from {effects}: both move the robot alike. "
-    "--accuracy states how accurate the data sheet is."
+    "A wrong data sheet at {parameters} moves the robot in these logs as {effects} would. --accuracy states "
+    "the accuracy of the data sheet."
 )
 
 
@@ -42,7 +42,7 @@ def less_accurate(found: Mapping[str, tuple[float, float, float]]) -> str:
 
 
 def remarks(known: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """A sentence for each suspect parameter, but one for all at a bound and one for all far off."""
+    """Return a sentence for each suspect parameter, but one for all at a bound and one for all far off."""
     bound = {name: p for name, p in known.items() if p.get("at_bound")}
     far = {name: p for name, p in known.items() if p.get("data_sheet")}
     texts = [f"{name} {p['structural']}." for name, p in known.items() if p["structural"] and name not in bound]

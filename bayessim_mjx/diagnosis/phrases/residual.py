@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis.gap import Gap, of_one
 from bayessim_mjx.diagnosis.phrases.effects import MOST
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.residual.flexible import Flexible
 from bayessim_mjx.diagnosis.residual.frequency import Heard
 from bayessim_mjx.diagnosis.residual.where import LIMITS, Fingerprint, Located
 from bayessim_mjx.diagnosis.result import Place
+from bayessim_mjx.diagnosis.statistics import Gap, of_one
 from bayessim_mjx.quantities import count, listed, percent
 
 AXES = {
@@ -22,15 +22,11 @@ AXES = {
     "speed size": "speed", "load size": "gravity load (size)", "effort size": "effort (size)",
 }  # fmt: skip
 OPPOSITES = ("against/with", "more/less")  # of which a number's sign chooses one
-# shares of the gain: of an input, of the largest joint's; less is not named; rules of thumb
-IMPORTANT, ACTS = 0.1, 0.2
-SEEN = 0.02  # control periods: shorter lags are not reported; a rule of thumb
-NEAR = 1.1  # ratio of frequencies that count as the same line; a rule of thumb
 
 
 @dataclass(frozen=True)
 class Signature:
-    """Words for a signature of the missing force: head of its sentence, {name of a number: words after it}."""
+    """Words for a signature of the missing force: head with its joint, {name of a number: words after it}."""
 
     head: str
     terms: Mapping[str, str]
@@ -38,21 +34,21 @@ class Signature:
 
 SIGNATURES = {
     "odd and even in speed": Signature(
-        "the missing force has a part of",
+        "the missing force at {joint} has a part of",
         {"constant": "against/with the motion at any speed", "linear": "against/with the motion, linear in speed",
-         "quadratic": "against/with the motion, quadratic in speed", "offset": "always the same way",
-         "even": "with speed but always the same way"},
+         "quadratic": "against/with the motion, quadratic in speed", "offset": "in one direction at any speed",
+         "even": "in one direction that grows with speed"},
     ),
-    "load": Signature("the force against the motion changes by", {"load": "of gravity load"}),
+    "load": Signature("the force against the motion at {joint} changes by", {"load": "of gravity load"}),
     "time": Signature(
-        "in the course of a log the force changes by",
-        {"friction": "against the motion", "drift": "always the same way"},
+        "in the course of a log the force at {joint} changes by",
+        {"friction": "against the motion", "drift": "in one direction"},
     ),
     "time since reversal": Signature(
-        "within {recent:g} s after reversals the force against the motion is", {"recent": "more/less"}
+        "within {recent:g} s after reversals the force against the motion at {joint} is", {"recent": "more/less"}
     ),
     "lag": Signature(
-        "the measured motion lags behind the simulated one by",
+        "the measured motion at {joint} lags behind the simulated one by",
         {"constant": "at any speed", "lag": "times the speed"},
     ),
 }  # fmt: skip
@@ -73,11 +69,9 @@ def located(found: Located) -> list[str]:
         ]
         if spot.looked and not forces:
             forces = [f"{spot.size:.2g} {spot.unit} rms, in no simple region of the state"]
-        text += [f"Without effects, the recalibrated simulator lacks at {spot.joint}: {'; '.join(forces)}."] * bool(
-            forces
-        )
+        text += [f"Without effects, a force is missing at {spot.joint}: {'; '.join(forces)}."] if forces else []
     signs = [signature for f in found.prints if (signature := _signature(f))]
-    return text + [f"Without effects, at {sign}." for sign in signs]
+    return text + [f"Without effects, {sign}." for sign in signs]
 
 
 def places(found: Located) -> list[Place]:
@@ -118,11 +112,11 @@ def _signature(found: Fingerprint) -> str:
         for key, words in own.terms.items()
         if (n := numbers.get(key)) is not None
     ]
-    return f"{found.joint} {own.head.format(recent=LIMITS.recent)} {', '.join(parts)}" if parts else ""
+    return f"{own.head.format(joint=found.joint, recent=LIMITS.recent)} {', '.join(parts)}" if parts else ""
 
 
 def signed(value: float, low: float, high: float, unit: str, phrase: str) -> str:
-    """A number with its interval and phrase; its sign in words where the phrase has a place for it."""
+    """Return a number with its interval and phrase; its sign in words where the phrase has a place for it."""
     for pair in OPPOSITES:
         if pair in phrase:
             positive = value > 0
@@ -137,37 +131,38 @@ def bracketed(value: float, low: float, high: float, unit: str) -> str:
 
 
 def spectra(found: Sequence[Heard]) -> list[str]:
-    """Delays, orders and lines, joint by joint, and a line that several joints share."""
-    each = [f"Without effects, at {heard.joint} {text}." for heard in found for text in _heard(heard)]
-    return each + _shared([(heard.joint, heard.line_hz) for heard in found])
+    """Name delays, orders and lines, joint by joint, and a line that several joints share."""
+    each = [f"Without effects, {text}." for heard in found for text in _heard(heard)]
+    return each + _shared(found)
 
 
 def _heard(found: Heard) -> list[str]:
     says, late = [], found.late
-    if late.low > SEEN * found.period:
+    if late.low > 0.0:
         ms = [f"{1e3 * x:.2g}" for x in (late.value, late.low, late.high)]
-        says.append(f"the effort acts as if {ms[0]} ms [{ms[1]}, {ms[2]}] later than commanded")
+        says.append(f"the effort at {found.joint} acts {ms[0]} ms [{ms[1]}, {ms[2]}] later than commanded")
+    missing = f"the missing force at {found.joint}"
     if found.orders:
         top = max(found.orders, key=lambda t: t["amplitude"])
         size = f"{top['amplitude']:.2g} {found.unit}"
-        says.append(f"the missing force repeats {top['order']} times per turn, amplitude {size}")
+        says.append(f"{missing} repeats {top['order']} times per turn, amplitude {size}")
     if found.height:
         above = f"{found.height:.2g} times above its surroundings"
-        says.append(f"the missing force has a line at {found.line_hz:.3g} Hz, {above}")
+        says.append(f"{missing} has a line at {found.line_hz:.3g} Hz, {above}")
     return says
 
 
-def _shared(lines: list[tuple[str, float]]) -> list[str]:
-    """A line common to several joints points to the mount, one in a single joint to its transmission."""
-    hz = [(name, f) for name, f in lines if np.isfinite(f)]
-    if len(hz) < 2 or max(f for _, f in hz) > NEAR * min(f for _, f in hz):
+def _shared(found: Sequence[Heard]) -> list[str]:
+    """Point to the mount where several joints have one line: no further apart than the spectra resolve."""
+    hz = {heard.joint: heard.line_hz for heard in found if np.isfinite(heard.line_hz)}
+    if len(hz) < 2 or max(hz.values()) - min(hz.values()) > found[0].picture["hz"][0]:
         return []
-    mean, joints = float(np.mean([f for _, f in hz])), listed([n for n, _ in hz])
+    mean, joints = float(np.mean(list(hz.values()))), listed(list(hz))
     return [f"The line near {mean:.3g} Hz is the same at {joints}: it points to the mount rather than to one joint."]
 
 
 def flexible_of(found: Flexible, on: str) -> dict[str, Any]:
-    """The numbers behind the sentences on a flexible force, for JSON.
+    """Return the numbers behind the sentences on a flexible force, for JSON.
 
     Args:
         on: the model that it is added to, `effects` or `recalibrated`.
@@ -181,43 +176,47 @@ def flexible_of(found: Flexible, on: str) -> dict[str, Any]:
         gap = Gap(cost, cost - own.gain, noise)
         at_noise = of_one(cost, noise).at_noise
         held[name] = {"significant": bool(own.significant), "closed": gap.closed, "at_noise": at_noise}
-    least = IMPORTANT * max(found.depends_on[0]["importance"], 0.5)
-    joints = [j for j, share in found.where.items() if share > ACTS * max(found.where.values())]
-    inputs = [d["input"] for d in found.depends_on if d["importance"] > least][:MOST]
+    joints = [j for j, share in found.where.items() if share >= np.mean(list(found.where.values()))]
+    usual = np.mean([d["importance"] for d in found.depends_on])
+    inputs = [d["input"] for d in found.depends_on if d["importance"] >= usual > 0.0][:MOST]
     return {"on": on, "held": held, "joints": joints, "inputs": inputs}
 
 
+def predicts(found: Mapping[str, Any]) -> bool:
+    """Whether a flexible force predicts a part of the residual, held out one way or the other; `flexible_of`."""
+    return any(held["significant"] for held in found["held"].values())
+
+
 def flexible(found: Mapping[str, Any], one_log: bool = False) -> list[str]:
-    """The part of a model's residual that a flexible force removes, its place and its inputs; `flexible_of`."""
-    others = ("other parts of the log", "the same parts at other times")
-    names = others if one_log else ("other operating conditions", "the same conditions at other times")
+    """Say which part of a model's residual a flexible force removes, its place and its inputs; `flexible_of`."""
+    names = ("by part of the log" if one_log else "by condition", "in time")
     held = dict(zip(names, (found["held"]["condition"], found["held"]["interpolation"]), strict=True))
-    of = "with the effects" if found["on"] == "effects" else "of the recalibrated simulator, without effects,"
-    if not any(h["significant"] for h in held.values()):
-        return [f"A flexible force predicts nothing of the residual {of} on data not used for fitting."]
+    of = "with the effects" if found["on"] == "effects" else "of the recalibrated simulator"
+    if not predicts(found):
+        return [f"A flexible force of motion and effort predicts nothing of the residual {of} on held-out data."]
     if not (loud := {how: h for how, h in held.items() if not h["at_noise"]}):
         return [f"The residual {of} lies within the measurement noise; a flexible force still predicts a part of it."]
-    shares = [f"{percent(h['closed'])} on {how}" for how, h in loud.items()]
+    (first, own), *others = loud.items()
+    more = "".join(f"; held out {how}, {percent(h['closed'])}" for how, h in others)
     depends = f"depends on {listed(found['inputs'])}" if found["inputs"] else "is constant: it depends on no input"
     return [
-        f"Of the squared residual {of} a flexible force removes {listed(shares)}.",
+        f"Held out {first}, a flexible force removes {percent(own['closed'])} of the squared residual {of}{more}.",
         f"This force acts at {listed(found['joints'])} and {depends}.",
     ]
 
 
 def black_boxes(found: BlackBoxes | None, one_log: bool = False) -> list[str]:
-    """The shares that black boxes close of the gap beside the named effects; nothing where they were not tried."""
+    """Say which shares black boxes close of the gap beside the named effects; nothing where they were not tried."""
     if found is None:
         return []
-    shares = [f"a small network without physics {_closes(found.network)}"]
+    shares = [f"a small network without physics closes {_closes(found.network)} of the squared gap"]
     shares += [f"a formula of {count(len(found.terms), 'term')} {_closes(found.formula)}"]
     shares += [f"the named effects {_closes(found.named)}"] if found.named == found.named else []
-    held = "parts of the log" if one_log else "conditions"
-    return [f"Shares of the squared gap that are closed on held-out {held}: {', '.join(shares)}."]
+    return [f"On held-out {'parts of the log' if one_log else 'conditions'} {listed(shares)}."]
 
 
 def _closes(share: float) -> str:
-    return percent(min(share, 1.0)) if share > 0 else "none"
+    return percent(min(share, 1.0)) if share > 0 else "nothing"
 
 
 def formula(found: BlackBoxes) -> list[str]:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bayessim_mjx.diagnosis import tolerance
-from bayessim_mjx.diagnosis.gap import of_one, of_rms
 from bayessim_mjx.diagnosis.phrases import effects as named
 from bayessim_mjx.diagnosis.phrases import parameters, residual
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
+from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
 from bayessim_mjx.quantities import extent, finite, listed, percent
 
 HEADS = {
@@ -20,35 +19,36 @@ HEADS = {
     "unexplained": "No effect of the library explains the gap: recalibration leaves {calibrated}.",
 }
 SMALL = " This exceeds the noise, but is too small to identify a cause."  # where the residual is above the noise
-PARTLY_HEAD = "Partly explained: {named}; more than the tolerance remains at {beyond}."
+PARTLY_HEAD = "Partly explained: {named}."
+PART = "The library explains only a part of the gap that recalibration leaves, {calibrated}."
 REST = "More than the tolerance remains at {beyond}."
 IMPERFECT = "No candidate closes the rest, {rest} of the squared gap: the law is not quite that of the real system."
-NEAREST = "Nearest in the library: {nearest}."
-LITTLE = "This is less than half: {they} {explain} little of the gap."
-ON_TOP = "Beside {them} a force is missing: it makes {remains} of the squared gap."
+NEAREST = "Nearest effects of the library: {nearest}."
+LITTLE = "At most half is closed: {they} {explain} little of the gap."
+ON_TOP = "Beside {them} a force is missing: that force makes {remains} of the squared gap."
 FALLS = (
-    "On held-out {held} {they} {reduce} the gap from {calibrated} to {with_effects}: {shown} of the squared gap above "
-    "the noise is closed."
+    "On held-out {held} {they} {reduce} the gap from {calibrated} to {with_effects}. This closes {shown} of the "
+    "squared gap above the noise."
 )
 PROMISED = (
-    "Before any fit, one linear step predicted {predicted}. With {them} {nested} without each {one} in turn, and "
-    "with the noise of the residuals as floor, {realised} is closed."
+    "Before any fit, one linear step predicted {predicted}. {nested} without each {one} in turn, {they} {close} "
+    "{realised} (floor: the noise of the residuals)."
 )
 ELSEWHERE = (
-    "If the effects are only chosen without each condition in turn, they close {elsewhere} of its gap; the fits behind "
-    "the choice had seen it, so these shares may be a little too high."
+    "If only the choice leaves it out, {they} {close} {elsewhere}. Both shares may be a little too high: the fits that "
+    "the choice compares had seen every condition."
 )
 IN_SAMPLE = "These numbers are in sample: one log is one operating condition, and other conditions may differ."
 WITHIN = "Every joint is within its tolerance (closest: {within})."
 PROBABLE = (
-    "Probability of this explanation among all fitted ones: {own}; of its rivals together: {others}; of the known "
-    "parameters alone: {nothing}."
+    "Probability among all fitted explanations: {own} for this one, {others}, {nothing} for the known parameters alone."
 )
-SPLITS = "To separate them, run the next experiment: {name}."
-HIDDEN = "Beside {them} these logs would not show {hidden}: numbers of {them} have the same influence on the motion."
+PAST = "The missing force depends on something else, such as the past of the motion."
+SPLITS = "To separate the explanations, run the next experiment: {name}."
+HIDDEN = "Beside {them} these logs would not show {hidden}: {their} numbers change the motion alike."
 BUILDS_UP = (
-    "Over whole logs the error grows to {times} times the size that noise, start and parameters explain, though it "
-    "hardly shows within {window}: the law or the simulator's time step is not quite right."
+    "Over whole logs the error is {times} times as large as noise, start and parameters explain. Within {window} it "
+    "hardly shows. The law or the simulator's time step is not quite right."
 )
 BENT = (
     "The effects need {far} of {known} known parameters far from the data sheet. Less than 1 of 10 000 robots is so by "
@@ -57,29 +57,31 @@ BENT = (
 )
 OF_SENSORS = "The residual has the covariance of sensor noise, {colour}."
 CHANCE = (
-    "No candidate and no flexible force predicts the residual, {calibrated}, on held-out {held}: process noise, an "
-    "input that was not logged, or noise larger than estimated."
+    "No candidate and no flexible force predicts the residual, {calibrated}, on held-out {held}. Possible causes: "
+    "process noise, an input that was not logged, or noise larger than estimated."
 )
 COASTS = (
-    "Joints that keep their speed in each window, without any simulator, are {coasting} noise sd off, less than the "
-    "recalibrated simulator's {calibrated}: its forces are far off, or hardly show in such short windows.{more}"
+    "Without any simulator, joints that keep their speed are {coasting} noise sd off, less than the recalibrated "
+    "simulator's {calibrated}. Its forces are far off, or hardly show in such short windows.{more}"
 )
 COASTS_CLOSED = " The effects close {closed} of the squared gap of such joints."
 
 
 def sentences(d: Diagnosis) -> list[str]:
-    """The verdict, most important first; each number is one of the result's."""
+    """Return the verdict, most important first; each number is one of the result's."""
     far, basis = d.gap, d.basis
-    texts = [_head(d), *_how_far(d), *_doubts(d), coasting(far, bool(d.effects)), _probable(basis)]
+    texts = [_head(d), *_how_far(d), *_doubts(d), coasting(far, bool(d.effects)), _probable(d)]
     ambiguous = [found for found in d.answers if len(found["members"]) > 1]
     texts += [SPLITS.format(name=d.next_experiment["name"])] if any(a["splits"] for a in ambiguous) else []
     them = "it" if len(d.effects) == 1 else "them"
     members = {label for a in d.answers for m in a["members"] for label in m["effects"]}
     hidden = [label for label in d.hidden if label not in members]  # a class already says that they are not separated
-    texts += [HIDDEN.format(them=them, hidden=named.any_of(hidden, named.MOST))] if hidden else []
+    their = "its" if len(d.effects) == 1 else "their"
+    texts += [HIDDEN.format(them=them, their=their, hidden=named.any_of(hidden, named.MOST))] if hidden else []
     texts += _noise(d)
     if d.verdict == "unexplained" and basis.get("flexible"):
         texts += residual.flexible(basis["flexible"], far.in_sample)
+        texts += [PAST] if basis.get("remains") and not residual.predicts(basis["flexible"]) else []
     if basis.get("efforts"):
         texts.append(f"By the logged efforts alone, {basis['efforts']}.")
     texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
@@ -89,7 +91,7 @@ def sentences(d: Diagnosis) -> list[str]:
 
 
 def _head(d: Diagnosis) -> str:
-    """The first sentence: the verdict with the place and the numbers of each effect."""
+    """Return the first sentence: the verdict with the place and the numbers of each effect."""
     far, fill = d.gap, _fill(d)
     if not d.effects or d.verdict not in ("effects", "ambiguous", "unexplained"):
         quoted = {"no_gap": far.nominal, "parameters": far.calibrated}.get(d.verdict)
@@ -97,7 +99,9 @@ def _head(d: Diagnosis) -> str:
         head = HEADS["no_gap"].partition(": ")[2] if above and d.verdict == "no_gap" else HEADS[d.verdict]
         return named.capital((head + SMALL * above).format(**fill))
     if d.verdict == "unexplained":
-        return (PARTLY_HEAD if far.beyond else HEADS["unexplained"]).format(named=named.lacking(d.effects), **fill)
+        gap = of_rms(far.calibrated, far.with_effects)
+        head = f"{PARTLY_HEAD} {REST}" if far.beyond else PART if gap.closed > gap.left else HEADS["unexplained"]
+        return head.format(named=named.lacking(d.effects), **fill)
     several = {a["effect"]: a for a in d.answers if len(a["members"]) > 1}
     open_ = [named.answer(e, several[label]) for e in d.effects if (label := f"{e.name}@{e.where}") in several]
     sure = [e for e in d.effects if f"{e.name}@{e.where}" not in several]
@@ -119,14 +123,15 @@ def _fill(d: Diagnosis) -> dict[str, str]:
         "beyond": listed([_left(n, far.physical[n]) for n in worst if n in far.beyond], most=3),
         "within": _within(far),
         "shown": percent(of_rms(far.calibrated, far.with_effects).closed),
-        "nested": "chosen and fitted" if far.closed.get("nested") else "fitted",
+        "nested": "Chosen and fitted" if far.closed.get("nested") else "Fitted",
+        "close": "closes" if one else "close",
         "rest": percent(of_rms(far.calibrated, far.with_effects).left),
         **{k: percent(far.closed.get(k)) for k in ("predicted", "realised", "elsewhere")},
     }
 
 
 def _how_far(d: Diagnosis) -> list[str]:
-    """The gap before and after, the shares closed, and the joints against their tolerances."""
+    """Return the gap before and after, the shares closed, and the joints against their tolerances."""
     far, basis, out = d.gap, d.basis, []
     left = of_rms(far.calibrated, far.with_effects).left
     if d.effects:
@@ -164,18 +169,19 @@ def _noise(d: Diagnosis) -> list[str]:
     memory, fill = d.basis.get("noise_memory"), _fill(d)
     if memory is not None and (d.verdict == "noise" or d.gap.beyond or not of_one(d.gap.with_effects**2).at_noise):
         return [OF_SENSORS.format(colour=f"correlated over about {1e3 * memory:.2g} ms" if memory else "white")]
-    held = (d.basis.get("flexible") or {}).get("held", {})
-    predicted = any(h["significant"] for h in held.values())
+    predicted = bool(d.basis.get("flexible")) and residual.predicts(d.basis["flexible"])
     return [CHANCE.format(**fill)] if d.basis.get("above_noise") and not d.effects and not predicted else []
 
 
-def _probable(basis: Mapping[str, Any]) -> str:
-    chance = basis.get("probability")
-    if not chance:
+def _probable(d: Diagnosis) -> str:
+    """Return the probability of the named effects, where they are the explanation."""
+    chance = d.basis.get("probability")
+    if not chance or (d.verdict == "unexplained" and not d.gap.beyond):
         return ""
-    nothing = percent(chance["nothing"])
+    own, others, nothing = (percent(chance[k]) for k in ("answer", "rivals", "nothing"))
     nothing = nothing if nothing.strip("0. %") else "less than one in a million"  # by the digits of `percent`
-    return PROBABLE.format(own=percent(chance["answer"]), others=percent(chance["rivals"]), nothing=nothing)
+    others = f"{others} for its rivals together" if chance["rivals"] else "which has no rival"
+    return PROBABLE.format(own=own, others=others, nothing=nothing)
 
 
 def coasting(far: Gap, named: bool) -> str:
@@ -213,7 +219,7 @@ def stage(far: Gap, name: str) -> str:
 
 
 def gap_line(far: Gap, effects: bool) -> str:
-    """The three gap numbers on one line of the terminal (the page has tiles, `report.sections`)."""
+    """Return the three gap numbers on one line of the terminal (the page has tiles, `report.sections`)."""
     words = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
     known = [s for s in words if finite(getattr(far, s)) and (effects or s != "with_effects")]
     return "Gap: " + ", ".join(f"{stage(far, s)} {words[s]}" for s in known) + "." if known else ""
@@ -237,23 +243,23 @@ def _left(name: str, row: Mapping[str, Any]) -> str:
 
 
 def _within(far: Gap) -> str:
-    """The joint that is closest to its tolerance."""
+    """Return the joint that is closest to its tolerance."""
     name = next((n for n in _worst(far) if far.physical[n].get("tolerance")), "")
     if not name:
         return ""
     row = far.physical[name]
     noise, unit = row.get("noise", 0.0), row["unit"]
-    above = float(tolerance.above_noise(row["with_effects"], noise))
-    return f"{name}, {extent(above, unit)} above the noise, of {extent(max(row['tolerance'], noise), unit)}"
+    above = float(above_noise(row["with_effects"], noise))
+    return f"{name}, {extent(above, unit)} of {extent(max(row['tolerance'], noise), unit)}, noise subtracted"
 
 
 def _by_joint(far: Gap, effects: bool) -> str:
-    """`By joint, recalibrated and with the effects: elbow 1.2 deg, 0.05 deg; ...`, the worst first."""
+    """`By joint, without and with the effects: elbow 1.2 deg to 0.05 deg; ...`, the worst first."""
     stages = ("calibrated", "with_effects") if effects else ("nominal", "calibrated")
-    words = "recalibrated and with the effects" if effects else "as delivered and recalibrated"
+    words = "without and with the effects" if effects else "before and after recalibration"
     names = _worst(far)
     rows = [
-        f"{n} {', '.join(extent(far.physical[n][s], far.physical[n]['unit']) for s in stages)}"
+        f"{n} {' to '.join(extent(far.physical[n][s], far.physical[n]['unit']) for s in stages)}"
         for n in names[: named.MOST]
     ]
     more = f"; {len(names) - named.MOST} more in the table" if len(names) > named.MOST else ""
@@ -266,12 +272,10 @@ def number(value: float) -> str:
 
 
 def horizon_warning(far: Gap) -> list[str]:
-    """A share that changes with the horizon is flagged."""
+    """Warn of a share closed that changes with the horizon: of one horizon its interval lies above another's."""
     loud = [row for row in far.horizons if not of_one(row["calibrated"] ** 2).at_noise]
+    ends = [[of_rms(row["calibrated"], level).closed for level in row["ci"]["with_effects"]] for row in loud]
+    differ = len(loud) > 1 and max(least for _, least in ends) > min(most for most, _ in ends)
     closed = {row["name"]: of_rms(row["calibrated"], row["with_effects"]).closed for row in loud}
-    differ = len(closed) > 1 and max(closed.values()) - min(closed.values()) >= DEPENDS
-    shares = ", ".join(f"{percent(share)} ({name})" for name, share in closed.items())
-    return [f"the share of the gap that is closed depends on the horizon: {shares}"] if differ else []
-
-
-DEPENDS = 0.3  # shares closed at two horizons that differ by more are warned of; a rule of thumb
+    each = [f"{percent(share) if share > 0 else 'none'} ({name})" for name, share in closed.items()]
+    return [f"the share of the gap that is closed depends on the horizon: {', '.join(each)}"] if differ else []

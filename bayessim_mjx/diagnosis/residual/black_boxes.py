@@ -17,12 +17,12 @@ from scipy.optimize import minimize
 
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
-from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.residual import motion_inputs
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
 from bayessim_mjx.diagnosis.residual.regression import SIZES as CLIPPED
 from bayessim_mjx.diagnosis.residual.regression import OnFeatures, Regression, Sums
+from bayessim_mjx.diagnosis.statistics import Gap
 
 Array = NDArray[np.float64]
 FOLDS = 4  # of conditions, at most: each is one more training of the network; a rule of thumb

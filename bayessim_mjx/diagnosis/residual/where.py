@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.gap import of_one
 from bayessim_mjx.diagnosis.residual import motion_inputs, regions
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate, step_of_starts
 from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
 from bayessim_mjx.diagnosis.residual.regions import ALONG, Leaf, Nodes, Tree
-from bayessim_mjx.diagnosis.statistics import interval
+from bayessim_mjx.diagnosis.statistics import interval, of_one
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES as HELD_OUT
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
-from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS
+from bayessim_mjx.diagnosis.statistics import Gap
 
 Array = NDArray[np.float64]
 

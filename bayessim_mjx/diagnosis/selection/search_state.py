@@ -10,11 +10,11 @@ import numpy as np
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.simulable import contacts
-from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.models import Key, Model
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, FLOOR, PRIORS
 from bayessim_mjx.diagnosis.selection.screen import Screened, Secants
+from bayessim_mjx.diagnosis.statistics import Gap
 
 
 @dataclass(frozen=True)

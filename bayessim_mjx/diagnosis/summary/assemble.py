@@ -15,17 +15,17 @@ from bayessim_mjx.diagnosis.findings import Findings, Where
 from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.phrases import first_look, residual
 from bayessim_mjx.diagnosis.phrases.verdict import horizon_warning, sentences
+from bayessim_mjx.diagnosis.request import length_unit
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
-from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap, Place
+from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
 from bayessim_mjx.diagnosis.selection import bounds
 from bayessim_mjx.diagnosis.selection.budget import SINGLES
 from bayessim_mjx.diagnosis.selection.models import BASE, systematic
+from bayessim_mjx.diagnosis.selection.numbers import HIDDEN
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, ranked
-from bayessim_mjx.diagnosis.summary import effects_found, how_far, known_parameters
-from bayessim_mjx.diagnosis.summary.finer_steps import AtFinerSteps
+from bayessim_mjx.diagnosis.summary import estimates, how_far
+from bayessim_mjx.diagnosis.summary.again import AtFinerSteps, Whole
 from bayessim_mjx.diagnosis.summary.verdict import Verdict, force_in_numbers, verdict_of
-from bayessim_mjx.diagnosis.summary.whole_logs import Whole
-from bayessim_mjx.diagnosis.tolerance import length_unit
 from bayessim_mjx.effects import spec_of
 from bayessim_mjx.logs.log import Channels
 
@@ -33,7 +33,7 @@ PACKAGES = ("bayessim-mjx", "mujoco", "mujoco-mjx", "jax", "numpy")  # what the 
 
 
 def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: str = "") -> Diagnosis:
-    """The result of what was found: numbers first, and then the sentences that are made of them.
+    """Make the result of the findings: numbers first, and then the sentences that are made of them.
 
     Args:
         about: what was diagnosed, see `Diagnosis`; file: name of the proposal's command file, where there is one.
@@ -42,12 +42,12 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     own = selection.estimated
     together = own.covariance + np.diag(systematic(model, setup.fitter.simulator.windows.dt) ** 2)
     finer = found.part(AtFinerSteps)
-    steps = finer.notes(found, together) if finer else []
+    steps = finer.notes(model, together) if finer else []
     base = len(setup.fitter.base)
     together = _told(found, together + finer.covariance(base) if finer else together)
     sd = np.sqrt(np.diag(together))
-    closed = effects_found.closed_by(found)
-    effects = effects_found.effects_of(found, sd, closed)
+    closed = estimates.closed_by(found)
+    effects = estimates.effects_of(found, sd, closed)
     far = how_far.measured(found, {k: v for k, v in closed.items() if k != "each"})
     verdict = verdict_of(found, far)
     known = own.mean[:base] + (finer.shift[:base] if finer else 0.0)
@@ -64,19 +64,19 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         effects=effects,
         where=residual.places(where.found) if where and where.found.spots else _where(found),
         gap=far,
-        parameters=known_parameters.parameters(selection, model, sd, known),
+        parameters=estimates.parameters(selection, model, sd, known),
         candidates=ranking(selection.state),
-        warnings=[*notes, *known_parameters.less_accurate(model, own.sheet), *found.warnings],
+        warnings=[*notes, *estimates.less_accurate(model, own.sheet), *found.warnings],
         next_experiment=experiment,
         versions=versions.of(PACKAGES),
-        details=details(found, effects, closed) | more,
+        details=details(found) | more,
         covariance={"names": list(model.fit.names), "matrix": together},
         not_fitted=not_fitted(selection.state),
         about={**about, "conditions": setup.fitter.simulator.windows.conditions} if about else {},
         hidden=list(selection.hidden),
-        accuracy=known_parameters.accuracy(model, own.sheet),
+        accuracy=estimates.accuracy(model, own.sheet),
         evidence=selection.weighed.to_dicts(),
-        answers=effects_found.answers(effects, experiment),
+        answers=estimates.answers(effects, experiment),
         basis=basis(found, verdict),
     )
     rivals = residual.black_boxes(found.part(BlackBoxes), setup.fitter.simulator.windows.blocks)
@@ -85,7 +85,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
 
 
 def basis(found: Findings, verdict: Verdict) -> dict[str, Any]:
-    """The numbers behind the sentences that stand nowhere else in the result, see `Diagnosis.basis`."""
+    """Return the numbers behind the sentences that stand nowhere else in the result, see `Diagnosis.basis`."""
     state, cut, weighed = found.selection.state, found.setup.fitter.simulator.windows, found.selection.weighed
     window = cut.steps * cut.dt
     top, rivals = found.flexible_winner, sum(weighed.weight[k] for k in weighed.beside)
@@ -107,7 +107,7 @@ def basis(found: Findings, verdict: Verdict) -> dict[str, Any]:
 
 
 def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
-    """The covariance without what it says of parameters that end at a bound."""
+    """Return the covariance without its entries for parameters that end at a bound."""
     model, physics = found.model, found.setup.physics
     at = []
     for effect in model.effects:
@@ -160,22 +160,11 @@ def _where(found: Findings) -> list[Place]:
 
 
 def insufficient(reason: str, notes: Sequence[str], about: Mapping[str, Any] | None = None) -> Diagnosis:
-    """The verdict where nothing can be held out."""
+    """Return the verdict where nothing can be held out."""
     nothing = Gap(1.0, *(float("nan"),) * 4)
     said = [f"Too little data: {reason}."]
-    return Diagnosis(
-        "insufficient_data",
-        said,
-        [],
-        [],
-        nothing,
-        {},
-        [],
-        list(notes),
-        {},
-        versions.of(PACKAGES),
-        about=dict(about or {}),
-    )
+    about, own = dict(about or {}), versions.of(PACKAGES)
+    return Diagnosis("insufficient_data", said, [], [], nothing, {}, [], list(notes), {}, own, about=about)
 
 
 def not_fitted(state: SearchState) -> dict[str, list[str]]:
@@ -206,20 +195,16 @@ def _reason(state: SearchState, label: str, gains: dict[str, float]) -> str:
     return phrases.LESS_PROMISING if state.above_noise(state.base) else phrases.NOTHING_LEFT
 
 
-MANY = 24  # candidates in the isolability matrix, overlays in the report: a page of a few MB; a rule of thumb
-
-
-def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any]) -> dict[str, Any]:
+def details(found: Findings) -> dict[str, Any]:
+    """Return the numbers of the pictures, see `report`."""
     model, cut = found.model, found.setup.fitter.simulator.windows
-    each, deviation = known_parameters.per_condition(found.setup.fitter, model)
+    each, deviation = estimates.per_condition(found.setup.fitter, model)
     names = model.fit.names
     return {
         "effect_specs": {e.name: spec_of(e) for e in found.setup.physics.effects if e.quantities},
         "overlays": _overlays(found),
         "isolability": _isolability(found.selection.state),
         "episodes": _episodes(found),
-        "closure": _closure(effects, closed),
-        "shapley": [{"effect": f"{e.name}@{e.where}", "share": e.share} for e in effects if e.share == e.share],
         "flexible": _flexible(found),
         "black_boxes": _black_boxes(found.part(BlackBoxes)),
         "groups": {
@@ -241,19 +226,8 @@ def details(found: Findings, effects: list[FoundEffect], closed: dict[str, Any])
     }  # fmt: skip
 
 
-def _closure(effects: list[FoundEffect], closed: dict[str, Any]) -> list[dict[str, Any]]:
-    """Promised and realised, of each effect and of all together."""
-    labels = [f"{e.name}@{e.where}" for e in effects]
-    rows: list[dict[str, Any]] = [
-        {"effects": [n], "predicted": e.predicted_gap_closed, "realised": e.gap_closed, "ci": e.gap_closed_ci}
-        for n, e in zip(labels, effects, strict=True)
-    ]
-    both = {k: closed[k] for k in ("predicted", "realised", "ci")} if len(rows) > 1 else {}
-    return [*rows, {"effects": labels} | both] if both else rows
-
-
 def _flexible(found: Findings) -> dict[str, Any]:
-    """The flexible force on the recalibrated simulator and on top of the effects, in noise standard deviations."""
+    """Return the flexible force on the recalibrated simulator and beside the effects, in noise standard deviations."""
     base = found.flexible_base
     winner = found.flexible_winner if found.model.effects else None
     shown, on = winner or base, "effects" if winner else "recalibrated"
@@ -288,7 +262,7 @@ def _overlays(found: Findings) -> list[dict[str, Any]]:
         own = np.flatnonzero(cut.log == r)
         for joint in range(model.njnt):
             q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-            if int(model.jnt_type[joint]) not in (2, 3) or len(out) >= MANY or not len(own) or not log.seen_dofs[v]:
+            if int(model.jnt_type[joint]) not in (2, 3) or not len(own) or not log.seen_dofs[v]:
                 continue
             rows = np.concatenate([np.arange(cut.start[w] + 1, cut.start[w] + 1 + cut.steps) for w in own])
             entry: dict[str, Any] = {
@@ -306,7 +280,7 @@ def _overlays(found: Findings) -> list[dict[str, Any]]:
 
 def _isolability(of: SearchState) -> dict[str, Any]:
     """|cos| between what the candidates change in the residual, known parameters and starts projected out."""
-    some = [s for s in of.screened if s.absorbed < 0.999][:MANY]
+    some = [s for s in of.screened if s.absorbed < HIDDEN]
     if len(some) < 2:
         return {}
     columns = np.stack([s.column.reshape(-1) for s in some])

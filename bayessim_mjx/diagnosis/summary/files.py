@@ -18,12 +18,12 @@ from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting import journal
 from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.gap import of_one
 from bayessim_mjx.diagnosis.phrases import first_look
 from bayessim_mjx.diagnosis.result import Diagnosis, load, plain
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.setup import Setup
+from bayessim_mjx.diagnosis.statistics import of_one
 from bayessim_mjx.diagnosis.summary import assemble
 from bayessim_mjx.errors import UserError
 
@@ -76,12 +76,16 @@ class Files(Observer):
             journal.remove(self.folder / SEARCH)
 
     def result(self, found: Findings) -> Diagnosis:
-        """The findings as a Diagnosis; writes the proposed experiment as a file that can be played."""
+        """Make a Diagnosis of the findings; write the proposed experiment as a file that can be played."""
         proposal, name = found.part(Experiment), ""
         if self.folder is not None and proposal is not None and proposal.chosen is not None:
             source = str(self.folder / "diagnosis.json")
             name = write_command(self.folder / COMMAND, proposal, source).name
         return assemble.diagnosis_of(found, self.about, name)
+
+    def insufficient(self, reason: str, notes: Sequence[str], robot: Robot) -> Diagnosis:
+        """Make and write the result where nothing can be held out."""
+        return self.whole(assemble.insufficient(reason, notes, self.about), robot)
 
     def whole(self, result: Diagnosis, robot: Robot) -> Diagnosis:
         """Write everything but the report; returns the result as it is loaded again."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -15,28 +15,24 @@ from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck import noise
+from bayessim_mjx.diagnosis.request import Tolerance
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection import heldout
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
-from bayessim_mjx.diagnosis.summary import whole_logs
-from bayessim_mjx.diagnosis.tolerance import Tolerance
+from bayessim_mjx.diagnosis.summary.again import Whole
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
-SHORT = 0.1  # s, the first horizon: a few control steps; a rule of thumb
 
 
 def measured(found: Findings, closed: dict[str, Any]) -> Gap:
-    """The gap over the windows and a shorter horizon; `with_whole` adds that over whole logs."""
+    """Measure the gap over the windows and over a shorter horizon: the geometric mean of one step and a window."""
     setup, predictions = found.setup, found.predictions
     cut, allowed = setup.fitter.simulator.windows, setup.tolerance
     again = repeats(setup.fitter, found.model.fit, setup.logs)
-    short, still = (
-        max(1, min(round(SHORT / cut.dt), cut.steps // 2)),
-        constant_velocity_baseline(cut, setup.robot.mj_model),
-    )
+    still = constant_velocity_baseline(cut, setup.robot.mj_model)
     rows = []
-    for steps in (short, cut.steps):
+    for steps in (round(cut.steps**0.5), cut.steps):
         row = heldout.stages({k: p.cost(steps) for k, p in predictions.items()}, cut.condition)
         row |= _floor(again, steps, row)
         each = {s: by_joint(p, steps, allowed) for s, p in predictions.items()}
@@ -64,8 +60,8 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
     )
 
 
-def with_whole(far: Gap, over: whole_logs.Whole, allowed: Tolerance) -> Gap:
-    """The gap with one more horizon: whole logs, where some can be predicted."""
+def with_whole(far: Gap, over: Whole, allowed: Tolerance) -> Gap:
+    """Return the gap with one more horizon: whole logs, where some can be predicted."""
     if not len(over.group):
         return far
     row = heldout.stages(over.cost, over.group)
@@ -106,7 +102,7 @@ def _remains(last: Prediction, allowed: Tolerance) -> dict[str, dict[str, Any]]:
 
 
 def _floor(again: Any, steps: int, row: dict[str, Any]) -> dict[str, Any]:
-    """What no model can undercut: what repeats of the same commands differ by; the noise where there are none."""
+    """Return the floor of every model: the difference of repeated commands; the noise where there are none."""
     if again is None:
         return _level(1.0, (1.0, 1.0), row, "noise")
     prediction, group = again
@@ -115,26 +111,15 @@ def _floor(again: Any, steps: int, row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _level(level: float, ci: tuple[float, float], row: dict[str, Any], source: str) -> dict[str, Any]:
-    """The floor of one horizon, between the noise and what the last stage reaches; adds its interval to the row's."""
+    """Return the floor of one horizon, between noise and last stage; its interval is added to the row's."""
     low, high = (max(v, 1.0) for v in ci)
     level = min(max(level, 1.0), row["with_effects"])
     row["ci"]["reducible_floor"] = [min(low, level), max(level, min(high, row["ci"]["with_effects"][1]))]
     return {"reducible_floor": float(level), "floor": source}
 
 
-@dataclass(frozen=True)
-class Limits:
-    """When runs count as repeated; rules of thumb."""
-
-    fewest: int = 3  # windows with a repeat: with fewer no floor is given
-    same: float = 0.001  # of a command's range: commands that are the same
-
-
-LIMITS = Limits()
-
-
 def repeats(fitter: Fitter, fit: Fit, logs: Sequence[Log]) -> tuple[Prediction, NDArray[np.int64]] | None:
-    """The error of a perfect model of what repeats, window by window, and the windows' conditions `[P]`.
+    """Return the error of a perfect model of what repeats, window by window, and the windows' conditions `[P]`.
 
     Two runs of the same commands differ by twice the variance of what is not reproducible. What comes of their
     different start states is taken out as it is from a model's errors, by the fit's derivatives.
@@ -146,16 +131,16 @@ def repeats(fitter: Fitter, fit: Fit, logs: Sequence[Log]) -> tuple[Prediction, 
         None where nothing was repeated.
     """
     cut = fitter.simulator.windows
-    errors, group = [], []
+    model = fitter.simulator.physics.mj_model
+    errors, offsets, group = [], [], []
     for w, partner in _pairs(fitter, logs):
-        a, b = (_states(fitter.simulator.physics.mj_model, cut.logs[r]) for r in (cut.log[w], partner))
         rows = slice(int(cut.start[w]) + 1, int(cut.start[w]) + 1 + cut.steps)
-        d = _apart(fitter.simulator.physics.mj_model, a[rows], b[rows])[:, fitter.used] / fitter.sigma / np.sqrt(2)
-        errors.append(_settled(d, fit.B[w], fitter.spread))
+        d = _apart(model, cut.logs[cut.log[w]], cut.logs[partner], rows)[:, fitter.used] / fitter.sigma / np.sqrt(2)
+        error, offset = _settled(d, fit.B[w], fitter.spread)
+        errors.append(error)
+        offsets.append(offset)
         group.append(cut.group[w])
-    if len(errors) < LIMITS.fewest:
-        return None
-    return Prediction(np.stack(errors), np.zeros((len(errors), fit.offsets.shape[1]))), np.array(group)
+    return (Prediction(np.stack(errors), np.stack(offsets)), np.array(group)) if errors else None
 
 
 def _pairs(fitter: Fitter, logs: Sequence[Log]) -> Iterator[tuple[int, int]]:
@@ -168,31 +153,32 @@ def _pairs(fitter: Fitter, logs: Sequence[Log]) -> Iterator[tuple[int, int]]:
     for w, (r, start) in enumerate(zip(cut.log, cut.start, strict=True)):
         for other in (p for group in groups if r in group for p in group if p != r):
             rows = slice(int(start), int(start) + cut.steps)
-            if len(cut.logs[other]) > rows.stop and _same(cut.logs[r].ctrl, cut.logs[other].ctrl, rows):
+            a, b = cut.logs[r], cut.logs[other]
+            if len(b) > rows.stop and np.allclose(a.ctrl[rows], b.ctrl[rows]):
                 yield w, other
 
 
-def _same(a: Array, b: Array, rows: slice) -> bool:
-    return bool((np.abs(a[rows] - b[rows]) <= LIMITS.same * np.ptp(a, axis=0) + 1e-12).all())
+def _apart(model: mujoco.MjModel, a: Log, b: Log, rows: slice) -> Array:
+    """b - a `[H, 2 nv]` in some rows, positions in the tangent space."""
+    return np.concatenate([_displaced(model, a.qpos[rows], b.qpos[rows]), b.qvel[rows] - a.qvel[rows]], axis=1)
 
 
-def _states(model: mujoco.MjModel, log: Log) -> Array:
-    return np.concatenate([log.qpos, log.qvel], axis=1)
-
-
-def _apart(model: mujoco.MjModel, a: Array, b: Array) -> Array:
-    """b - a `[H, 2 nv]`, positions in the tangent space."""
-    out = np.zeros((len(a), 2 * model.nv))
-    for k, (x, y) in enumerate(zip(a, b, strict=True)):
-        mujoco.mj_differentiatePos(model, out[k, : model.nv], 1.0, x[: model.nq], y[: model.nq])
-    out[:, model.nv :] = b[:, model.nq :] - a[:, model.nq :]
+def _displaced(model: mujoco.MjModel, begin: Array, end: Array) -> Array:
+    """end - begin `[H, nv]` of positions `[H, nq]`, in the tangent space of each beginning."""
+    out = np.zeros((len(end), model.nv))
+    for row, x, y in zip(out, begin, end, strict=True):
+        mujoco.mj_differentiatePos(model, row, 1.0, x, y)
     return out
 
 
-def _settled(d: Array, B: Array, spread: Array) -> Array:
-    """d `[H, channels]` without what other start states explain: derivatives B `[n, s]`, a prior of `spread` each."""
+def _settled(d: Array, B: Array, spread: Array) -> tuple[Array, Array]:
+    """(d `[H, channels]` without the part that other start states explain, these states `[s]`).
+
+    Args:
+        B: `[H channels, s]`, derivatives by the start state; spread: `[s]`, of its Gaussian prior.
+    """
     x = np.linalg.solve(B.T @ B + np.diag(1.0 / np.square(spread)), B.T @ d.reshape(-1))
-    return np.asarray(d - (B @ x).reshape(d.shape))
+    return np.asarray(d - (B @ x).reshape(d.shape)), np.asarray(x)
 
 
 def constant_velocity_baseline(windows: Windows, model: mujoco.MjModel) -> Prediction:
@@ -203,38 +189,18 @@ def constant_velocity_baseline(windows: Windows, model: mujoco.MjModel) -> Predi
     almost all of its gap. Measured beside this predictor they close nothing. Start states are estimated on each window
     as those of a simulation are.
     """
-    moved, started = _displacements(windows, model)
-    time = windows.dt * np.arange(1, windows.steps + 1)
-    precise_q, precise_v = (_precision(s) for s in (windows.sigma_q, windows.sigma_v))
-    loose_q, loose_v = np.split(_precision(windows.spread), 2)
-    qvel = np.asarray(windows.batch.qvel, np.float64) - started[:, None]
-    ahead = moved - started[:, None] * time[:, None]  # what the measured start state leaves
-
-    # weighted least squares of (position, speed) at the start, each degree of freedom on its own
-    a = windows.steps * precise_q + loose_q
-    b = time.sum() * precise_q
-    c = np.sum(time**2) * precise_q + windows.steps * precise_v + loose_v
-    right_q = precise_q * ahead.sum(1)
-    right_v = precise_q * np.einsum("whv,h->wv", ahead, time) + precise_v * qvel.sum(1)
-    shared = a * c - b**2
-    position, speed = (c * right_q - b * right_v) / shared, (a * right_v - b * right_q) / shared
-    error = [ahead - position[:, None] - speed[:, None] * time[:, None], qvel - speed[:, None]]
+    around, time = windows.batch.around, windows.dt * np.arange(1, windows.steps + 1)[:, None]
+    qpos, qvel = (np.asarray(x, np.float64) for x in (windows.batch.qpos, windows.batch.qvel))
+    begins = np.repeat(np.asarray(around.qpos, np.float64)[:, around.start, None], windows.steps, axis=1)
+    speed = np.asarray(around.qvel, np.float64)[:, around.start, None]
     sigma = np.concatenate([windows.sigma_q, windows.sigma_v])
-    used = np.isfinite(sigma)
-    return Prediction(np.concatenate(error, 2)[..., used] / sigma[used], np.concatenate([position, speed], 1))
-
-
-def _displacements(windows: Windows, model: mujoco.MjModel) -> tuple[Array, Array]:
-    """(`[W, H, nv]` from each window's measured start, in its tangent; `[W, nv]`, measured speeds there)."""
-    around = windows.batch.around
-    begins, qpos = (np.asarray(x, np.float64) for x in (np.asarray(around.qpos)[:, around.start], windows.batch.qpos))
-    out = np.zeros((*qpos.shape[:2], model.nv))
-    for row, begin, there in zip(out, begins, qpos, strict=True):
-        for one, position in zip(row, there, strict=True):
-            mujoco.mj_differentiatePos(model, one, 1.0, begin, position)
-    return out, np.asarray(around.qvel[:, around.start], np.float64)
-
-
-def _precision(sigma: Array) -> Array:
-    """1 / sigma^2; 0 where nothing is measured."""
-    return np.where(np.isfinite(sigma), np.asarray(sigma, np.float64) ** -2, 0.0)
+    used, one = np.isfinite(sigma), np.eye(model.nv)
+    # derivatives by (position, speed) at the start: of positions 1 and the time, of speeds 0 and 1
+    B = np.stack([np.block([[one, t * one], [0 * one, one]]) for t in time[:, 0]])[:, used] / sigma[used, None]
+    errors, offsets = [], []
+    for begin, end, slope, rates in zip(begins, qpos, speed, qvel, strict=True):
+        ahead = np.concatenate([_displaced(model, begin, end) - slope * time, rates - slope], axis=1)
+        error, offset = _settled(ahead[:, used] / sigma[used], B.reshape(-1, 2 * model.nv), windows.spread)
+        errors.append(error)
+        offsets.append(offset)
+    return Prediction(np.stack(errors), np.stack(offsets))

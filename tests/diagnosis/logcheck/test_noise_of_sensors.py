@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis import tolerance
+from bayessim_mjx.diagnosis import request
 from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.logcheck import noise
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free, noise_known
@@ -52,7 +52,7 @@ def test_fewer_than_three_values_in_every_log_tell_no_noise(arm, elbows):
     (text,) = noise.not_compared(logs)
     assert text.startswith("qpos:elbow: fewer than 3 values") and "quantum" in text
     assert not noise_free(logs, 1)  # or the time step's own error would be its noise
-    limit = tolerance.judge(arm, np.array([2.0, 0.0]), noise.noise_of_positions(logs), {}).limit
+    limit = request.judge(arm, {}, np.array([2.0, 0.0]), noise.noise_of_positions(logs)).limit
     assert np.isfinite(limit[0]) and np.isinf(limit[1])  # no step is too coarse for it
 
 

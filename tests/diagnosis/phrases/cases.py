@@ -5,9 +5,12 @@ Each exists for sentences that no other has. Numbers are chosen so that shares c
 
 import dataclasses
 
-from bayessim_mjx.diagnosis.phrases import advice, parameters, verdict
+import numpy as np
+
+from bayessim_mjx.diagnosis.phrases import advice, notes, parameters, verdict
+from bayessim_mjx.diagnosis.request import Tolerance
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect, Gap
-from bayessim_mjx.diagnosis.summary.effects_found import answers
+from bayessim_mjx.diagnosis.summary.estimates import answers
 
 ROW = {
     "nominal": 0.0214, "calibrated": 0.0107, "with_effects": 0.000866, "unit": "rad", "tolerance": 0.02,
@@ -72,7 +75,7 @@ def gap(far=LEVEL, rows=None, **changes):
 
 def every():
     """{what it shows: result}."""
-    left = {"hinge": ROW | {"with_effects": 0.03, "beyond": True}, "elbow": ROW}
+    left = {"hinge": ROW | {"with_effects": 0.03, "largest": 0.09, "beyond": True}, "elbow": ROW}
     some = gap(rows=left, with_effects=3.0)
     quiet = {"nominal": 1.1, "calibrated": 1.0, "with_effects": 1.0}
     loud = {"nominal": 1.4, "calibrated": 1.3, "with_effects": 1.3}
@@ -108,11 +111,37 @@ def every():
         "unexplained by chance": made("unexplained", flexible=NOTHING, not_tried=short),
         "partly": made("unexplained", [FRICTION], some, remains=0.2, flexible=FORCE),
         "nearest": made("unexplained", [GAIN], gap(with_effects=6.0), far_off=(3, 6)),
-        "little is closed": made("unexplained", [GAIN], gap(with_effects=8.0)),
+        "little is closed": made(
+            "unexplained", [GAIN], gap(with_effects=8.0), probability=chance, remains=0.4, flexible=NOTHING
+        ),
         "beside joints that keep their speed": made("unexplained", [GAIN], gap(with_effects=6.0, coasting=5.0)),
         "known parameters": made("effects", [FRICTION], parameters=known, builds_up=3.0),
         "one parameter": made("effects", [FRICTION], parameters=few, efforts="the motors follow"),
     }  # fmt: skip
+
+
+def warnings():
+    """Notes that stand among the warnings."""
+    one = np.ones(1)
+    allowed = Tolerance(("hinge",), ("rad",), 1e-3 * one, one, 0.01 * one, one > 0)
+    names = [f"log {i}" for i in range(8)]
+    away = {"nominal": 2, "calibrated": 0}
+    levels = [("0.1 s", 3.0, 1.1), ("whole log", 9.0, 12.0)]
+    rows = [{"name": n, "calibrated": c, "with_effects": w, "ci": {"with_effects": [w, w]}} for n, c, w in levels]
+    return [
+        notes.left_out("whole logs"),
+        notes.left_out("where", ValueError("no windows")),
+        *notes.below_noise(allowed),
+        *notes.rows(0.0001, 0.002, 0.0005, fastest=True),
+        *notes.rows(0.001, 0.002, 0.001, fastest=False),
+        *notes.conditions(1, one_log=True),
+        *notes.conditions(3, one_log=False),
+        *notes.finer_steps([("hinge.delay", 0.012, 0.002, "s", 0.0002), ("mass", 1.0, 0.1, "kg", 0.1)]),
+        *notes.whole_logs(names, names[:6], names[6:7], 2.4, away, 7, 3),
+        *notes.whole_logs(names, names, [], 0.0, {}, 0, 0),
+        *verdict.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=rows)),
+        parameters.less_accurate({"mass": (0.2, 0.1, 0.4)}),
+    ]
 
 
 def text():
@@ -121,6 +150,7 @@ def text():
     for name, d in every().items():
         said = advice.verdict_of(d)
         parts.append("\n".join([f"# {name}", f"[{said.badge}] {said.advice}", *d.sentences]))
+    parts.append("\n".join(["# warnings", *warnings()]))
     return "\n\n".join(parts) + "\n"
 
 

@@ -88,7 +88,7 @@ def _closed(said: Said) -> Iterator[tuple[str, str]]:
             continue
         if said["effects"] and levels[1] > levels[0]:
             yield "words", f"the gap rises from {levels[0]} to {levels[1]}: {sentence}"
-        quoted = re.search(rf"({NUMBER}) %(?: did| of the squared gap above the noise is closed)", sentence)
+        quoted = re.search(rf"This closes ({NUMBER}) % of the squared gap above the noise", sentence)
         own = share(said["gap"]["calibrated"], said["gap"]["with_effects"])
         if quoted and said["effects"] and not math.isnan(own) and abs(float(quoted[1]) / 100 - own) > 0.02:
             yield "share", f"{quoted[1]} % closed, {own:.1%} by {levels[0]} -> {levels[1]}"
@@ -101,19 +101,19 @@ def _quoted(said: Said) -> Iterator[tuple[str, str]]:
     closed, sheet = gap.get("closed") or {}, {k: share(*v) for k, v in _falls(said).items()}
     exact = {
         r"linear step predicted": [closed.get("predicted")],
-        r"as floor,": [closed.get("realised")],
-        r"they close (?=\S+ % of its gap)": [closed.get("elsewhere")],
+        "in turn, the effect closes": [closed.get("realised")],
+        "in turn, the effects close": [closed.get("realised")],
+        "leaves it out, the effect closes": [closed.get("elsewhere")],
+        "leaves it out, the effects close": [closed.get("elsewhere")],
         r"closes the rest,": [1.0 - sheet["effects"]],
-        r"it makes": [basis.get("remains")],
-        r"among all fitted ones:": [chance.get("answer")],
-        r"rivals together:": [chance.get("rivals")],
+        r"that force makes": [basis.get("remains")],
+        "among all fitted explanations:": [chance.get("answer")],
+        "for this one,": [chance.get("rivals")],
         r"force removes": held,
         r"The effects close": [max(sheet["coasting"], 0.0)],
     }
     for before, of in re.findall(rf"({'|'.join(exact)}) ?({NUMBER}) %", text_of(said)):
-        (values,) = (
-            v for pattern, v in exact.items() if re.fullmatch(pattern.partition("(?=")[0].strip(), before.strip())
-        )
+        values = exact[before]
         if not any(v is not None and rounds_to(100 * v, of) for v in values):
             yield "share", f"'{before} {of} %', in the data {[round(v, 4) for v in values if v is not None]}"
     known = [*numbers(said), *(1 - v for v in numbers(gap)), *sheet.values(), 1 - sheet["effects"], 0.9, 0.1]
@@ -234,7 +234,10 @@ def main(paths: list[str]) -> None:
     files = 0
     for path in paths:
         said = json.loads(Path(path).read_text())
-        found = contradictions(said.get("said", said))
+        said = said.get("said", said)
+        details = Path(path).with_name("details.json")  # has the shares of the black boxes
+        more = json.loads(details.read_text()).get("black_boxes") if details.is_file() else None
+        found = contradictions(said | {"black_boxes": more})
         files += bool(found)
         kinds.update(kind for kind, _ in found)
         for kind, text in found:

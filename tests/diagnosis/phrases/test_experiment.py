@@ -16,7 +16,7 @@ def test_why_an_experiment_is_proposed():
         "run release"
     )
     assert phrases.tells_apart(action, titles, 4.04, True, 10.0) == (
-        f"{action}: separates {titles[0]} from {titles[1]} and {titles[2]}, expected evidence 4.0 nats; "
+        f"{action}: separates {titles[0]} from {titles[1]}, or {titles[2]}, expected evidence 4.0 nats; "
         "repeat it 3 times for a decision"
     )
     text = phrases.tells_apart(action, titles[:2], 25.2, False, 10.0)
@@ -27,6 +27,6 @@ def test_why_an_experiment_is_proposed():
         f"{action}: it should divide the standard deviation of mass by 4"
     )
     assert phrases.sharpens_little("release", "mass", 0.2, 0.16) == (
-        "no experiment of the menu adds much; the best, release: it should divide the standard deviation of mass by 1.2"
+        "no experiment of the menu adds much; the best, release, leaves 80 % of the standard deviation of mass"
     )
     assert phrases.separating(["unheard_of"]) == "a known payload, two mount orientations, or a measured effort"

@@ -38,7 +38,7 @@ def test_a_flexible_force_removes_a_share_of_the_residual_above_the_noise():
     found = SimpleNamespace(condition=held(5.0, 3.0), samples=50, where={"elbow": 1.0}, depends_on=depends)
     found.interpolation = held(1.3, 0.2)
     first, second = residual.flexible(residual.flexible_of(found, "effects"))
-    assert first.endswith("with the effects a flexible force removes 75 % on other operating conditions.")
+    assert first == "Held out by condition, a flexible force removes 75 % of the squared residual with the effects."
     assert second == "This force acts at elbow and depends on the speed of elbow."
     found.condition = held(1.3, 0.2)
     (text,) = residual.flexible(residual.flexible_of(found, "recalibrated"))

@@ -87,7 +87,7 @@ def test_a_push_is_the_same_way_everywhere():
     found = where.locate(*case)
     places, sentences = places_of(found), located_in_words(found)
     assert places[0].region == "everywhere"
-    assert sentences[0] == ("Without effects, the recalibrated simulator lacks at shoulder: +0.08 N m (everywhere).")
+    assert sentences[0] == ("Without effects, a force is missing at shoulder: +0.08 N m (everywhere).")
     assert prints(case, 0)["odd and even in speed"].numbers["offset"].value == pytest.approx(0.08, rel=0.05)
 
 

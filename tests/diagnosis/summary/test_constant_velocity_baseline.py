@@ -76,7 +76,7 @@ def test_a_simulator_that_is_worse_than_none_is_told():
     known = Gap(1.0, 300.0, 222.0, 26.6, 1.0, coasting=32.3)
     # 1 - (26.6^2 - 1) / (32.3^2 - 1)
     told = coasting(known, named=True)
-    assert "32.3 noise sd off, less than the recalibrated simulator's 222: " in told
+    assert "32.3 noise sd off, less than the recalibrated simulator's 222. " in told
     assert "The effects close 32 % of the squared gap of such joints." in told
     assert "effects" not in coasting(known, named=False)
     assert coasting(dataclasses.replace(known, coasting=250.0), named=True) == ""

@@ -11,8 +11,8 @@ from bayessim_mjx.diagnosis.fitting import discretisation, robot
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.setup import prepare
-from bayessim_mjx.diagnosis.summary import finer_steps
-from bayessim_mjx.diagnosis.summary.finer_steps import AtFinerSteps
+from bayessim_mjx.diagnosis.summary import again
+from bayessim_mjx.diagnosis.summary.again import AtFinerSteps
 from tests.diagnosis.pendulums import ARMATURE, DAMPING, FEW, MASS, MODEL, fitted, recorded
 
 SCALE = (1.1, 1.15, 0.95)
@@ -36,7 +36,7 @@ def test_where_parameters_would_go_at_finer_steps_is_where_the_truth_is(tmp_path
         estimated=SimpleNamespace(step=lambda r: likeliest(dataclasses.replace(fit, r=r), fitter))
     )
     found = SimpleNamespace(setup=setup, model=SimpleNamespace(fit=fit, effects=()), selection=selection)
-    shift = finer_steps._shift(found)
+    shift = again._shift(found)
     damping, armature, mass = np.abs(fit.values - SCALE)
     assert armature > 0.01
     _, S = fit.quadratic(fitter.spread)[0].weighted(fit.weight)
@@ -63,17 +63,17 @@ def test_shifts_are_told_of_effects_where_they_are_more_than_two_standard_deviat
     coordinates = [SimpleNamespace(name=n, unit=u) for n, u in (("mass", "kg"), ("stall", "N m"), ("speed", "rad/s"))]
     fit = SimpleNamespace(coordinates=coordinates, values=np.array([1.0, 3.5, 20.0]))
     effect = SimpleNamespace(coordinates=coordinates[1:])
-    found = SimpleNamespace(model=SimpleNamespace(fit=fit, effects=(effect,)))
+    model = SimpleNamespace(fit=fit, effects=(effect,))
     together = np.diag([1e-6, 1e-4, 1.0])
-    (told,) = AtFinerSteps(np.array([0.5, 0.1, 1.9])).notes(found, together)
-    assert "stall 3.6 in place of 3.5 N m (counted in their intervals)" in told
+    (told,) = AtFinerSteps(np.array([0.5, 0.1, 1.9])).notes(model, together)
+    assert "stall 3.6 in place of 3.5 N m (their intervals allow for it)" in told
     assert "mass" not in told and "speed" not in told
-    assert AtFinerSteps(np.array([0.5, 0.01, 1.9])).notes(found, together) == []
+    assert AtFinerSteps(np.array([0.5, 0.01, 1.9])).notes(model, together) == []
 
 
 @pytest.mark.parametrize(("integrator", "touching"), [("RK4", False), ("Euler", True)])
 def test_nothing_is_simulated_where_it_would_say_nothing(monkeypatch, integrator, touching):
     model = mujoco.MjModel.from_xml_string(MODEL % (COARSE, integrator, DAMPING, ARMATURE, 0.0, MASS))
     found = found_at(None, robot=SimpleNamespace(mj_model=model), physics=None)
-    monkeypatch.setattr(finer_steps, "contacts", lambda physics: touching)
-    assert finer_steps.stage(found, lambda text, done, total: None) is found
+    monkeypatch.setattr(again, "contacts", lambda physics: touching)
+    assert again.at_finer_steps(found, lambda text, done, total: None) is found

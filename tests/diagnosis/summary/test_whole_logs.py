@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import run
-from bayessim_mjx.diagnosis.request import Request
-from bayessim_mjx.diagnosis.summary import assemble, whole_logs
+from bayessim_mjx.diagnosis.request import Request, Tolerance
+from bayessim_mjx.diagnosis.summary import again, assemble
 from tests.diagnosis import pendulums
 from tests.diagnosis.pendulums import PERIOD, nominal, recorded
 
@@ -24,15 +24,12 @@ def rubbing(tmp_path_factory):
 @pytest.mark.ci
 def test_a_log_begins_as_its_first_window(rubbing):
     cut = rubbing.setup.fitter.simulator.windows
-    stages = {
-        "nominal": whole_logs._Stage(rubbing.selection.state.base, rubbing.predictions["nominal"], True),
-        "with_effects": whole_logs._Stage(rubbing.model, rubbing.predictions["with_effects"], False),
-    }
+    stages = ("nominal", "with_effects")
     first = int(np.flatnonzero(cut.log == 2)[0])
-    chains = whole_logs._chains(rubbing.setup, np.array([2]), [int(cut.start[first])], 3 * cut.steps)
-    (rows,) = whole_logs._simulated(rubbing, chains, stages, whole_logs._root(rubbing, rubbing.model), [first])
-    for row, stage in zip(rows, stages.values(), strict=False):
-        np.testing.assert_allclose(row[: cut.steps], stage.prediction.error[first], atol=0.05)
+    chains = again._chains(rubbing.setup, np.array([2]), [int(cut.start[first])], 3 * cut.steps)
+    (rows,) = again._simulated(rubbing, chains, stages, [first])
+    for row, stage in zip(rows, stages, strict=False):
+        np.testing.assert_allclose(row[: cut.steps], rubbing.predictions[stage].error[first], atol=0.05)
 
 
 @pytest.mark.ci
@@ -53,21 +50,20 @@ def test_whole_logs_are_the_third_horizon(rubbing):
 @pytest.mark.ci
 def test_each_log_has_draws_of_its_own(rubbing):
     """Common draws of the parameters would let one of them stand for all logs."""
-    cut, root = rubbing.setup.fitter.simulator.windows, whole_logs._root(rubbing, rubbing.model)
-    stages = {"with_effects": whole_logs._Stage(rubbing.model, rubbing.predictions["with_effects"], False)}
+    cut, law = rubbing.setup.fitter.simulator.windows, 0.1 * np.eye(len(rubbing.model.fit.values))
     away = []
     for w in (int(np.flatnonzero(cut.log == log)[0]) for log in range(3)):
-        thetas, _ = whole_logs._drawn(rubbing, stages, root, w)
-        away.append(thetas[-whole_logs.RULES.likely :] - thetas[0])
+        thetas, _ = again._drawn(rubbing, ["with_effects"], law, w)
+        away.append(thetas[-again.DRAWS :] - thetas[0])
     assert np.ptp(away[0], axis=0).max() > 0
     assert not np.allclose(away[0], away[1], rtol=0.01) and not np.allclose(away[1], away[2], rtol=0.01)
 
 
 def test_what_is_likely_is_noise_and_what_draws_leave_of_the_mean():
     error, likely = np.full((10, 2), 3.0), np.full((4, 10, 2), 2.0)
-    assert whole_logs._beyond(error, likely) == pytest.approx(9 / (1 + 4))
+    assert again.beyond(error, likely) == pytest.approx(9 / (1 + 4))
     likely[0, 3] = np.nan  # a draw that diverged
-    assert whole_logs._beyond(error, likely) == pytest.approx(9 / (1 + 4))
+    assert again.beyond(error, likely) == pytest.approx(9 / (1 + 4))
 
 
 @pytest.mark.slow
@@ -75,15 +71,18 @@ def test_an_unstable_motion_counts_as_long_as_it_can_be_predicted(tmp_path, monk
     upside_down = pendulums.MODEL.replace("<option ", '<option gravity="0 0 9.81" ')
     monkeypatch.setattr(pendulums, "MODEL", upside_down)  # held upright by its controller; open loop it falls
     found = run.investigate(nominal(tmp_path), recorded(friction=0.04, count=4, seconds=3.0), Request(EFFECTS[:1]))
-    over = whole_logs.simulate(found)
+    over = again.whole_logs(found)
     assert "unstable or chaotic motion: in 4 of 4 logs" in over.notes[0]
     assert over.seconds < 2.5 and (over.name.startswith("up to") or not len(over.group))
 
 
 @pytest.mark.ci
 def test_the_start_s_uncertainty_decides_how_long():
-    grows = 1e-3 * np.exp(5.0 * PERIOD * np.arange(200))  # in parts of the motion, 5/s
-    steps = whole_logs._predictable(np.repeat(grows[None, :, None], 4, 0), np.ones(1))
-    assert steps * PERIOD == pytest.approx(np.log(whole_logs.RULES.part / 1e-3) / 5.0, abs=PERIOD)
-    assert whole_logs._predictable(np.full((4, 200, 1), 0.01), np.ones(1)) == 200
-    assert whole_logs._predictable(np.where(np.arange(200) < 50, 0.0, np.nan)[None, :, None], np.ones(1)) == 50
+    """Until it exceeds the tolerance of .1 rad, a hundred noises; a motion that is no longer finite ends there."""
+    one = np.ones(1)
+    allowed = Tolerance(("hinge",), ("rad",), 0.1 * one, one, 1e-3 * one, one > 0)
+    grows = np.exp(5.0 * PERIOD * np.arange(200))  # in noises, 5/s
+    steps = again.predictable(np.repeat(grows[None, :, None], 4, 0), allowed)
+    assert steps * PERIOD == pytest.approx(np.log(100) / 5.0, abs=PERIOD)
+    assert again.predictable(np.full((4, 200, 1), 10.0), allowed) == 200
+    assert again.predictable(np.where(np.arange(200) < 50, 0.0, np.nan)[None, :, None], allowed) == 50

@@ -1,4 +1,4 @@
-"""Numbers of the named effects: estimates, scores among rivals, what each closes, as promised and as realised."""
+"""Numbers of named effects and of known parameters: estimates, scores among rivals, shares closed, suspect values."""
 
 from __future__ import annotations
 
@@ -6,27 +6,29 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import statistics
-from bayessim_mjx.diagnosis.evidence.selecting import Rival
+from bayessim_mjx.diagnosis import data_sheet, statistics
+from bayessim_mjx.diagnosis.correction import UNIFORM
+from bayessim_mjx.diagnosis.evidence.parameters import Posterior
+from bayessim_mjx.diagnosis.evidence.selecting import Rival, Selection
 from bayessim_mjx.diagnosis.evidence.weighing import Size, size_of
 from bayessim_mjx.diagnosis.findings import Findings
-from bayessim_mjx.diagnosis.fitting.candidates import Candidate
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
+from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.phrases import effects as phrases
+from bayessim_mjx.diagnosis.phrases import parameters as remarks
+from bayessim_mjx.diagnosis.phrases.effects import CLEAR
 from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.selection import bounds, heldout
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
 
-# operating conditions, from which on closure is quoted of conditions that the choice was made without: without one of
-# two, a single one is left to choose by, which has no standard error over conditions (n - 1 = 0 degrees of freedom);
-# source: Student's t
-LEAST = 3
-UNKNOWN = 0.5  # of its range: a larger standard deviation than a uniform prior's, .29, says nothing; a rule of thumb
+Array = NDArray[np.float64]
 
 
-def effects_of(found: Findings, sd: np.ndarray, closed: dict[str, Any]) -> list[FoundEffect]:
-    """The effects of the verdict with all their numbers, the one that closes most first."""
+def effects_of(found: Findings, sd: Array, closed: dict[str, Any]) -> list[FoundEffect]:
+    """List the effects of the verdict with all their numbers, the one that closes most first."""
     parts = _parts(found, closed)
     out = [_effect(found, e, sd, parts[e.label]) for e in found.model.effects]
     return sorted(out, key=lambda e: -e.gap_closed)
@@ -112,10 +114,11 @@ def nested(found: Findings) -> bool:
 
     The costs behind such a choice are of fits that had seen the condition: it is not free of it altogether.
     """
-    return min(len(found.selection.chosen), found.setup.fitter.simulator.windows.conditions) >= LEAST
+    count = min(len(found.selection.chosen), found.setup.fitter.simulator.windows.conditions)
+    return count - 1 > 1  # others, of which a choice needs two: n - 1 degrees of freedom (Student's t)
 
 
-def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> FoundEffect:
+def _effect(found: Findings, effect: Candidate, sd: Array, part: _Part) -> FoundEffect:
     setup, model = found.setup, found.model
     rivals = found.selection.rivals.get(effect.label, ())
     weighed = [r for r in rivals if not r.contains]
@@ -128,7 +131,7 @@ def _effect(found: Findings, effect: Candidate, sd: np.ndarray, part: _Part) -> 
         bound = bounds.of(setup.physics, c, value)
         deviation = float(sd[i]) if bound is None or bound.kind == "off" else float("nan")
         numbers[word] = Estimate(value, deviation, _unit(setup, effect, c.unit), bound.kind if bound else "")
-        clause = _bound(bound, c.unit) if bound else phrases.UNKNOWN if deviation > UNKNOWN * (c.high - c.low) else ""
+        clause = _bound(bound, c.unit) if bound else phrases.UNKNOWN if deviation > UNIFORM * (c.high - c.low) else ""
         ends += [f"{word.replace('_', ' ')} {clause}"] if clause else []
     shared = _shared(effect, size_of(effect, model.fit.values[own], sd[own]), weighed, weights)
     return FoundEffect(
@@ -188,7 +191,7 @@ def _weights(found: Findings, models: list[Model]) -> list[float]:
 
 
 def _unit(setup: Setup, effect: Candidate, unit: str) -> str:
-    """A hinge's unit as a slide's, where the place is a slide."""
+    """Return a hinge's unit as a slide's, where the place is a slide."""
     model = setup.physics.mj_model
     if effect.kind not in ("joint", "actuator") or effect.where == "all":
         return unit
@@ -198,13 +201,90 @@ def _unit(setup: Setup, effect: Candidate, unit: str) -> str:
         return unit
     if joint < 0 or int(model.jnt_type[joint]) != 2:
         return unit
-    swap = {
-        "rad/(N m)": "m/N",
-        "N m/rad": "N/m",
-        "N m s/rad": "N s/m",
-        "N m s": "N s/m",
-        "kg m^2": "kg",
-        "N m": "N",
-        "rad": "m",
+    if unit == "N m s":
+        return "N s/m"
+    return unit.replace("kg m^2", "kg").replace("N m", "N").replace("(N)", "N").replace("rad", "m")
+
+
+def parameters(selection: Selection, model: Model, sd: Array, mean: Array) -> dict[str, dict[str, Any]]:
+    """Rows of the result's table: {name: the robot's value (`mean`), its sd, the simulated value, bounds, remarks}."""
+    suspect = structural(selection.state.fitter, model)
+    base, values = selection.state.fitter.base, model.fit.values
+    real = [float(np.clip(v, c.low, c.high)) for c, v in zip(base, mean, strict=True)]
+    return {
+        c.name: {
+            **_against_data_sheet(c, real[i], float(model.fit.belief()[i])),
+            "mean": real[i], "simulated": float(values[i]), "sd": float(sd[i]), "nominal": c.neutral,
+            "low": c.low, "high": c.high, "unit": c.unit, "structural": suspect.get(c.name, ""),
+            "at_bound": _at_bound(c, float(values[i])),
+            "same_as": list(selection.stand_ins.get(c.name, ())),
+        }
+        for i, c in enumerate(base)
+    }  # fmt: skip
+
+
+def _against_data_sheet(c: Coordinate, value: float, precision: float) -> dict[str, Any]:
+    """Return the distance of a known parameter from its stated value, in words and in sd, if larger than `CLEAR`."""
+    away = abs(value - c.neutral) * precision**0.5
+    if not (c.stated and away > CLEAR):
+        return {"data_sheet": ""}
+    return {"data_sheet": remarks.far_from_data_sheet(value, away), "away": away}
+
+
+def accuracy(model: Model, sheet: Posterior) -> dict[str, dict[str, float]]:
+    """{kind: quantiles of its accuracy, and how many parameters it has}, of kinds whose accuracy was not stated."""
+    every = [c.kind for c in model.fit.coordinates]
+    ends = {kind: sheet.accuracy(kind) for kind in sheet.kinds}
+    return {
+        kind: {"median": middle, "low": low, "high": high, "parameters": every.count(kind)}
+        for kind, (low, middle, high) in ends.items()
     }
-    return swap.get(unit, unit.replace("N m", "N").replace("rad", "m"))
+
+
+def less_accurate(model: Model, sheet: Posterior) -> list[str]:
+    """Remark on kinds of parameters that are farther from their data sheet than usual, with 95 % probability."""
+    every = accuracy(model, sheet).items()
+    found = {k: (own["median"], own["low"], own["high"]) for k, own in every if own["low"] > data_sheet.ACCURACY}
+    return [remarks.less_accurate(found)] if found else []
+
+
+def structural(fitter: Fitter, model: Model) -> dict[str, str]:
+    """{known parameter: remark} where it sits at a bound or moves between conditions (Wald test, Bonferroni)."""
+    from scipy import stats  # takes long to import
+
+    base, groups = len(fitter.base), len(model.estimates)
+    pairs = zip(model.fit.coordinates[:base], model.fit.values, strict=False)
+    out = {c.name: remarks.stuck(v) for c, v in pairs if _at_bound(c, v)}
+    if groups < 3:
+        return out
+    each, deviation = per_condition(fitter, model)
+    for i, c in enumerate(model.fit.coordinates[:base]):
+        own, sd = each[:, i], deviation[:, i]
+        z2 = float(np.sum(((own - np.average(own, weights=1 / sd**2)) / sd) ** 2))
+        p = float(stats.chi2.sf(z2, groups - 1)) * base
+        spread = float(np.std(own))
+        if p < 1e-3 and spread > 0.05 * (c.high - c.low) and c.name not in out:
+            out[c.name] = remarks.moves(spread, groups, fitter.simulator.windows.blocks)
+    return out
+
+
+def _at_bound(c: Coordinate, value: float) -> bool:
+    return bool(min(value - c.low, c.high - value) < 1e-3 * (c.high - c.low))
+
+
+def per_condition(fitter: Fitter, model: Model) -> tuple[Array, Array]:
+    """Estimates and standard deviations `[G, k]` of each condition alone, one Newton step from the common fit."""
+    q, _ = model.fit.quadratic(fitter.spread)
+    _, _, low, high = model.fit.prior()
+    precision = model.fit.belief()
+    pull = precision * (np.array([c.neutral for c in model.fit.coordinates]) - model.fit.values)
+    group = fitter.simulator.windows.group
+    each, deviation = [], []
+    inflation = max(model.total / model.fit.r.size, 0.5) * model.fit.r.size / model.samples
+    for name in np.unique(group):
+        g, S = q.weighted(model.fit.weight * (group == name))
+        H = S / inflation + np.diag(precision)
+        covariance = np.linalg.pinv(H)
+        each.append(model.fit.values + np.clip(covariance @ (g / inflation + pull), low, high))
+        deviation.append(np.sqrt(np.diag(covariance)))
+    return np.array(each), np.array(deviation)

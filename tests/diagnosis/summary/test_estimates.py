@@ -7,11 +7,11 @@ import pytest
 from scipy.stats import norm
 
 from bayessim_mjx.diagnosis.evidence.weighing import Size
-from bayessim_mjx.diagnosis.summary import effects_found
+from bayessim_mjx.diagnosis.summary import estimates
 
 
 @pytest.mark.parametrize(
-    ("deviation", "sentence"), [(2.0, "To previous is not identified by these logs."), (0.9, ""), (0.001, "")]
+    ("deviation", "sentence"), [(2.0, "To previous is not identified by these logs."), (0.5, ""), (0.001, "")]
 )
 def test_a_share_that_reaches_no_joint_is_said_to_be_unidentified(monkeypatch, deviation, sentence):
     """A drive at the end of a chain has one neighbour; ranges are from -1 to 1."""
@@ -22,10 +22,10 @@ def test_a_share_that_reaches_no_joint_is_said_to_be_unidentified(monkeypatch, d
     fit = SimpleNamespace(names=list(names), values=np.array([-0.027, 0.0]))
     model = SimpleNamespace(fit=fit, effects=(effect,))
     found = SimpleNamespace(setup=SimpleNamespace(physics=None), model=model, selection=SimpleNamespace(rivals={}))
-    monkeypatch.setattr(effects_found.bounds, "of", lambda physics, coordinate, value: None)
-    monkeypatch.setattr(effects_found, "_unit", lambda setup, effect, unit: unit)
-    part = effects_found._Part(1.0, 1.0, (0.9, 1.0), 1.0)
-    found_ = effects_found._effect(found, effect, np.array([0.003, deviation]), part)
+    monkeypatch.setattr(estimates.bounds, "of", lambda physics, coordinate, value: None)
+    monkeypatch.setattr(estimates, "_unit", lambda setup, effect, unit: unit)
+    part = estimates._Part(1.0, 1.0, (0.9, 1.0), 1.0)
+    found_ = estimates._effect(found, effect, np.array([0.003, deviation]), part)
     assert found_.sentence == sentence
     assert found_.parameters["to_previous"].sd == deviation
 
@@ -42,14 +42,14 @@ def test_rivals_of_one_unit_share_a_size():
         rival("filter@hinge", Size("time_constant", 0.013, 0.001, "s")),
         rival("bias@motor", Size("bias", 1, 1, "N m")),
     ]
-    shared = effects_found._shared(effect, own, rivals, [0.5, 0.25, 0.25])
+    shared = estimates._shared(effect, own, rivals, [0.5, 0.25, 0.25])
     assert shared["effects"] == ["delay@motor", "filter@hinge"] and shared["unit"] == "s"
     assert shared["mean"] == pytest.approx(0.011)
     below = [
         2 / 3 * norm.cdf(x, 0.010, 0.001) + 1 / 3 * norm.cdf(x, 0.013, 0.001) for x in (shared["low"], shared["high"])
     ]
     assert below == pytest.approx([0.05, 0.95], abs=1e-6)
-    assert effects_found._shared(effect, own, rivals[1:], [0.7, 0.3]) == {}
+    assert estimates._shared(effect, own, rivals[1:], [0.7, 0.3]) == {}
 
 
 @pytest.mark.parametrize(("conditions", "chosen", "nested"), [(1, 5, False), (2, 2, False), (3, 3, True)])
@@ -60,4 +60,4 @@ def test_a_choice_is_nested_from_three_conditions_on_and_never_within_one_log(co
         selection=SimpleNamespace(chosen=dict.fromkeys(range(chosen), frozenset()), elsewhere=0.9),
         setup=SimpleNamespace(fitter=SimpleNamespace(simulator=SimpleNamespace(windows=cut))),
     )
-    assert effects_found.nested(found) == nested
+    assert estimates.nested(found) == nested

@@ -1,0 +1,107 @@
+"""Notes among the warnings of a diagnosis: on its preparation, its stages, whole logs and finer steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from bayessim_mjx.diagnosis.phrases.effects import CLEAR, MOST
+from bayessim_mjx.diagnosis.request import Tolerance
+from bayessim_mjx.quantities import EXACT, extent, finite, listed
+
+STAGES = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
+
+
+def left_out(stage: str, error: Exception | None = None) -> str:
+    """Name a stage that failed with an error, or for which the time was over."""
+    if error is None:
+        return f"{stage}: left out, the time was over"
+    return f"{stage}: not available ({type(error).__name__}: {error})"
+
+
+def below_noise(allowed: Tolerance) -> list[str]:
+    """Name the tolerances that are below the noise."""
+    each = zip(allowed.names, allowed.units, allowed.limit, allowed.noise, allowed.given, strict=True)
+    return [
+        f"--tolerance {name}: {extent(limit, unit)} is below the noise, {extent(noise, unit)}: the noise is tolerated"
+        for name, unit, limit, noise, own in each
+        if own and limit < noise and finite(float(noise))
+    ]
+
+
+def rows(period: float, timestep: float, dt: float, fastest: bool) -> list[str]:
+    """Say that logs are faster than the comparison, or than the model's steps.
+
+    Args:
+        period: of the logs' rows, timestep: of the model, dt: control period of the diagnosis; s.
+        fastest: whether dt is the shortest that there is.
+    """
+    text = f"the logs have a row every {1e3 * period:.3g} ms"
+    if fastest and period < dt * (1 - EXACT):
+        return [f"{text}; one every {1e3 * dt:.3g} ms is compared"]
+    if timestep > dt * (1 + EXACT):
+        return [f"{text}, and the model steps {1e3 * timestep:.3g} ms: it is simulated at {1e3 * dt:.3g} ms"]
+    return []
+
+
+def conditions(count: int, one_log: bool) -> list[str]:
+    """Say that few operating conditions were logged."""
+    if one_log:
+        return [
+            "one log is one operating condition: parts of it are held out, so all numbers are in sample; "
+            "no interval between conditions is given"
+        ]
+    return [f"{count} operating conditions: intervals are rough"] if count < 4 else []
+
+
+def finer_steps(moved: Iterable[tuple[str, float, float, str, float]]) -> list[str]:
+    """Name the effects' parameters that finer time steps would move clearly.
+
+    Args:
+        moved: (name, value, shift, unit, standard deviation) of each.
+    """
+    parts = [
+        f"{name} {value + shift:.3g} in place of {value:.3g} {unit}".rstrip()
+        for name, value, shift, unit, sd in moved
+        if abs(shift) > CLEAR * sd
+    ]
+    text = "the time step of the simulator changes the parameters: finer steps would give"
+    return [f"{text} {', '.join(parts)} (their intervals allow for it)"] if parts else []
+
+
+def whole_logs(
+    names: Sequence[str],
+    chaotic: Sequence[str],
+    broken: Sequence[str],
+    seconds: float,
+    away: Mapping[str, int],
+    kept: int,
+    seen: int,
+) -> list[str]:
+    """Say how far whole logs can be predicted, and which stages fail on them.
+
+    Args:
+        chaotic, broken: logs that no simulator predicts whole, and that diverge, among `names`.
+        seconds: the longest time that counts. away: {stage: logs whose motion it leaves}, of `kept` logs.
+        seen: logs that are simulated in sample.
+    """
+    out = []
+    if chaotic:
+        used = f"they count up to there, {seconds:.2g} s at most" if kept else "they are not counted"
+        out.append(
+            f"unstable or chaotic motion: in {_some(chaotic, names)} the uncertain start alone exceeds the tolerance. "
+            f"No simulator can predict them whole: {used}"
+        )
+    if broken:
+        out.append(f"simulated open loop, {_some(broken, names)} diverge: whole logs are compared without them")
+    lost = [f"{STAGES[stage]} in {count} of {kept}" for stage, count in away.items() if count]
+    if lost:
+        text = "over whole logs the simulator leaves the measured motion"
+        out.append(f"{text} ({', '.join(lost)}): the size of its error says little")
+    if seen:
+        text = f"{seen} of {len(names)} whole logs are simulated with parameters fitted to them"
+        out.append(f"{text}: these errors are in sample")
+    return out
+
+
+def _some(few: Sequence[str], names: Sequence[str]) -> str:
+    return f"{len(few)} of {len(names)} logs ({listed(few, most=MOST)})"
