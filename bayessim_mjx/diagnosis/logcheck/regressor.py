@@ -146,22 +146,21 @@ class Regressor:
         slow = SLOW * np.percentile(np.abs(v), 95, axis=0) + 1e-12 if slow is None else slow
         dry = np.tanh(v / slow)
         rigid = rigid_body.rigid(model, moved.qpos, v, moved.qacc, sets)
-        spring = rigid_body.springs(model, moved.qpos)
-        known = rigid.nominal + spring + model.dof_damping * v + model.dof_armature * moved.qacc
+        known = rigid.nominal + rigid.spring + model.dof_damping * v + model.dof_armature * moved.qacc
         known += model.dof_frictionloss * dry
         position = np.zeros_like(v) + np.cumsum(v, 0) * moved.step
         for joint in np.flatnonzero(model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)):
             position[:, int(model.jnt_dofadr[joint])] = moved.qpos[:, int(model.jnt_qposadr[joint])]
         own = {
             "acceleration": moved.qacc, "speed": v, "dry": dry, "drag": v * np.abs(v), "position": position,
-            "one": np.ones_like(v), "load": np.abs(rigid.bias + spring) * dry,
+            "one": np.ones_like(v), "load": np.abs(rigid.bias + rigid.spring) * dry,
         }  # fmt: skip
         return cls(
             moved,
             columns=moved.smooth(rigid.columns),
             known=moved.smooth(known),
             weight=moved.smooth(rigid.weight),
-            spring=moved.smooth(spring),
+            spring=moved.smooth(rigid.spring),
             tilt=moved.smooth(rigid.tilt),
             own={name: moved.smooth(x) for name, x in own.items()},
             dry=dry,
