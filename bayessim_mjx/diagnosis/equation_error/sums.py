@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,26 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
-from bayessim_mjx.diagnosis.logcheck.regressor import SLOW, Mask, Motion, Regressor, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.regressor import Mask, Motion, Regressor, filtered, motion
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
 OWN = ("acceleration", "speed", "dry", "drag", "position", "one", "load", "effort_load")
-SHIFT = 1e-4  # rad or m, for the derivative by a joint's zero: exact to rounding, which costs 1e-12 of it
-
-
-@dataclass(frozen=True)
-class Budget:
-    """How much is looked at, and in how many parts logs are held out: seconds, not errors. Choices, not counted."""
-
-    rows: int = 12000  # of all logs together, at their own rates
-    folds: int = 3  # with fewer logs, each is cut into parts
-    parts: int = 4
-    most: int = 12  # parts of all logs together: those of more logs are held out side by side
-    many: int = 16  # dofs, beyond which zeros of joints are not looked at
-
-
-BUDGET = Budget()
+SHIFT = float(np.finfo(float).eps) ** (1 / 3)  # rad or m, of a central difference: rounding and curvature cost as much
+ROWS = 12000  # of all logs together, at their own rates: seconds, not errors; a choice, not counted
 
 
 @dataclass(frozen=True)
@@ -82,10 +68,10 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Products of the columns, `gram` `[F, nv, P, P]` by parts, each row counted as so many independent ones.
+    """Products of the columns, each row counted as so many independent ones.
 
     Attributes:
-        rows: `[F, nv]`, independent rows; source: `[nv]`, where the effort comes from (`sources`).
+        gram: `[nv, P, P]`; rows: `[nv]`, independent rows; source: `[nv]`, where the effort comes from (`sources`).
         period: s between the logs' rows.
     """
 
@@ -95,14 +81,9 @@ class Sums:
     source: tuple[str, ...]
     period: float
 
-    @cached_property
-    def whole(self) -> Array:
-        """`[nv, P, P]` of all parts."""
-        return np.asarray(self.gram.sum(0))
-
     def power(self, column: int) -> Array:
         """`[nv]`, mean square of a column."""
-        return np.asarray(self.whole[:, column, column] / np.maximum(self.rows.sum(0), 1e-9))
+        return np.asarray(self.gram[:, column, column] / np.maximum(self.rows, 1e-9))
 
     @cached_property
     def size(self) -> Array:
@@ -159,9 +140,8 @@ def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Arra
     for name, column in found.own.items():
         x[:, :, layout.own(name)] = column
     x[:, :, layout.own("effort_load")] = moved.smooth(np.abs(y) * found.dry)
-    if model.nv <= BUDGET.many:
-        for v, column in _zeros(model, moved).items():
-            x[:, :, layout.zero(v)] = moved.smooth(column)
+    for v, column in _zeros(model, moved).items():
+        x[:, :, layout.zero(v)] = moved.smooth(column)
     x[:, :, layout.effort], x[:, :, layout.late] = y, np.gradient(y, moved.step, axis=0)
     for i in layout.shared:
         dof = drives.dof_of(model, i)
@@ -189,28 +169,16 @@ def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
     each = [sources(log, model) for log in logs]
     source = tuple(_common(s) for s in zip(*each, strict=True))
     layout = layout_of(model)
-    short = _shortened(logs)
+    short = shortened(logs)
     top = np.max([np.percentile(np.abs(log.qvel), 95, axis=0) for log in short], axis=0)
-    grams, rows = [], []
-    parts = BUDGET.parts if len(short) < BUDGET.folds else 1
+    gram, rows = np.zeros((model.nv, layout.size, layout.size)), np.zeros(model.nv)
     for log in short:
-        x, moving, share = columns(log, model, source, SLOW * top + 1e-12)
-        for part in np.array_split(np.arange(len(x)), parts):
-            gram = np.zeros((model.nv, layout.size, layout.size))
-            count = np.zeros(model.nv)
-            for v in range(model.nv):
-                own = x[part[moving[v, part]], v]
-                gram[v], count[v] = share * own.T @ own, share * len(own)
-            grams.append(gram)
-            rows.append(count)
-    period = float(np.median([log.period for log in logs]))
-    return Sums(layout, _in_parts(grams), _in_parts(rows), source, period)
-
-
-def _in_parts(each: Sequence[Array]) -> Array:
-    """Sums of neighbours, at most `BUDGET.most`."""
-    ends = np.linspace(0, len(each), min(len(each), BUDGET.most) + 1).round().astype(int)
-    return np.array([np.sum(each[a:b], 0) for a, b in itertools.pairwise(ends)])
+        x, moving, share = columns(log, model, source, drives.LEAST * top + 1e-12)
+        for v in range(model.nv):
+            own = x[moving[v], v]
+            gram[v] += share * own.T @ own
+            rows[v] += share * len(own)
+    return Sums(layout, gram, rows, source, float(np.median([log.period for log in logs])))
 
 
 def _common(each: Sequence[str]) -> str:
@@ -220,9 +188,9 @@ def _common(each: Sequence[str]) -> str:
     return "ctrl" if set(each) == {"ctrl", "effort"} else ""
 
 
-def _shortened(logs: Sequence[Log]) -> list[Log]:
+def shortened(logs: Sequence[Log]) -> list[Log]:
     """The middle parts of logs that are too long together."""
-    share = BUDGET.rows / max(sum(len(log) for log in logs), 1)
+    share = ROWS / max(sum(len(log) for log in logs), 1)
     if share >= 1:
         return list(logs)
     spans = [(len(log), max(int(share * len(log)), min(len(log), 200))) for log in logs]

@@ -34,8 +34,8 @@ def lines(look: Look) -> list[str]:
         for label, why in look.vetoes.items()
         if label.startswith("actuator_gain@")
     ]
-    if look.identifiability and look.identifiability.unknown:
-        names = listed(look.identifiability.unknown, most=MOST)
+    if look.unknown:
+        names = listed(look.unknown, most=MOST)
         out.append(f"these logs determine the mass of {names} no better than the data sheet does")
     return out
 
