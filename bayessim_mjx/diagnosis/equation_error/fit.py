@@ -106,7 +106,7 @@ def used(sums: Sums) -> NDArray[np.bool_]:
 def left(sums: Sums, model: Array) -> Array:
     """`[nv]`, mean squares of what a model leaves."""
     rest = -model
-    rest[:, sums.layout.effort] += 1.0
+    rest[:, sums.layout.at("effort")] += 1.0
     return np.maximum(np.sum(rest * times(sums.gram, rest), -1), 0.0) / np.maximum(sums.rows, 1e-9)
 
 
@@ -122,7 +122,7 @@ def fit(sums: Sums, terms: Sequence[Term]) -> Fit:
     model, design = _effort(sums.layout, terms, spans, values)
     for _ in range(EFFORT.rounds):
         rest = design @ values - model
-        rest[:, sums.layout.effort] += 1.0
+        rest[:, sums.layout.at("effort")] += 1.0
         weight = np.where(on, 1.0 / (left(sums, model) + floor), 0.0)
         rows_of = (model.size, size)
         weighed = (weight[:, None, None] * design).reshape(rows_of).T
@@ -142,7 +142,7 @@ def fit(sums: Sums, terms: Sequence[Term]) -> Fit:
 def _effort(layout: Layout, terms: Sequence[Term], spans: Sequence[slice], values: Array) -> tuple[Array, Array]:
     """(effort `[nv, P]` as a map of the columns, its derivative `[nv, P, K]` by the coefficients)."""
     inner, scale, rest = np.zeros((3, layout.nv, layout.size))
-    inner[:, layout.known], scale[:] = 1.0, 1.0
+    inner[:, layout.at("known")], scale[:] = 1.0, 1.0
     design = np.zeros((*inner.shape, len(values)))
     for term, own in zip(terms, spans, strict=True):
         if term.shape is not None:

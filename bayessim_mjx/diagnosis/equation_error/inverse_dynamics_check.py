@@ -25,7 +25,7 @@ from bayessim_mjx.diagnosis.equation_error.sums import Sums
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, base_coordinates
 from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.logcheck import drives, gate
-from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel, channels_of
+from bayessim_mjx.diagnosis.logcheck.links import Channel, channels_of
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
@@ -167,8 +167,8 @@ def _joints(model: mujoco.MjModel, sums: Sums, nominal: Fit, found: Found) -> tu
     ]
     out = []
     for v in np.flatnonzero(on):
-        needed = float(whole[v, lay.known, lay.known])
-        ratio = float(whole[v, lay.known, lay.effort]) / needed if needed > 0 else float("nan")
+        needed = float(whole[v, lay.at("known"), lay.at("known")])
+        ratio = float(whole[v, lay.at("known"), lay.at("effort")]) / needed if needed > 0 else float("nan")
         ratio = ratio if sums.source[v] != "none" else float("nan")
         out.append(Joint(terms.joint_of(model, int(v)), sums.source[v], ratio, *(float(p[v]) for p in parts)))
     return tuple(out)

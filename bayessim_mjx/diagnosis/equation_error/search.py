@@ -13,8 +13,8 @@ from bayessim_mjx.diagnosis.data_sheet import DRIVES
 from bayessim_mjx.diagnosis.equation_error import fit as fitting
 from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
-from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel
 from bayessim_mjx.diagnosis.logcheck.drives import LEAST
+from bayessim_mjx.diagnosis.logcheck.links import Channel
 from bayessim_mjx.diagnosis.logcheck.timing import SURE
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS
 from bayessim_mjx.quantities import percent

@@ -22,7 +22,7 @@ ROWS = 12000  # of all logs together, at their own rates: seconds, not errors; a
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the columns stand: ten of each body, the joint's own (OWN), zeros [nv], drives, tilt, late, known, effort.
+    """Where the columns stand: ten of each body, the joint's own (OWN), zeros `[nv]`, drives, tilt [2], and others.
 
     shared: actuators that drive a joint together with others; each has a column of its own effort.
     """
@@ -31,39 +31,26 @@ class Layout:
     nv: int
     shared: tuple[int, ...] = ()
 
+    @cached_property
+    def _starts(self) -> dict[str, int]:
+        kinds = {"body": rigid_body.INERTIAL * self.bodies} | dict.fromkeys(OWN, 1)
+        kinds |= {"zero": self.nv, "drive": len(self.shared), "tilt": 2, "late": 1, "known": 1, "effort": 1, "end": 0}
+        return dict(zip(kinds, np.cumsum([0, *kinds.values()]).tolist(), strict=False))
+
     @property
     def size(self) -> int:
-        return rigid_body.INERTIAL * self.bodies + len(OWN) + self.nv + len(self.shared) + 5
+        return self.at("end")
+
+    def at(self, kind: str) -> int:
+        """The (first) column of one of OWN, or of zero, tilt, late, known (what the model says) and effort."""
+        return self._starts[kind]
 
     def body(self, i: int) -> slice:
         return slice(rigid_body.INERTIAL * i, rigid_body.INERTIAL * (i + 1))
 
-    def own(self, name: str) -> int:
-        return rigid_body.INERTIAL * self.bodies + OWN.index(name)
-
-    def zero(self, dof: int) -> int:
-        return rigid_body.INERTIAL * self.bodies + len(OWN) + dof
-
     def drive(self, actuator: int) -> int:
         """Of one of the actuators `shared`."""
-        return rigid_body.INERTIAL * self.bodies + len(OWN) + self.nv + self.shared.index(actuator)
-
-    @property
-    def tilt(self) -> slice:
-        return slice(self.size - 5, self.size - 3)
-
-    @property
-    def late(self) -> int:
-        return self.size - 3
-
-    @property
-    def known(self) -> int:
-        """What the nominal model says."""
-        return self.size - 2
-
-    @property
-    def effort(self) -> int:
-        return self.size - 1
+        return self.at("drive") + self.shared.index(actuator)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +76,7 @@ class Sums:
     def size(self) -> Array:
         """`[nv]`, rms of the effort, measured or needed; where nothing drives a joint, of what acts on it."""
         lay = self.layout
-        return np.sqrt(np.max([self.power(c) for c in (lay.effort, lay.known, lay.own("load"))], axis=0))
+        return np.sqrt(np.max([self.power(c) for c in (lay.at("effort"), lay.at("known"), lay.at("load"))], axis=0))
 
 
 def sources(log: Log, model: mujoco.MjModel) -> tuple[str, ...]:
@@ -131,18 +118,18 @@ def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Arra
     moved, layout = motion(log, model), layout_of(model)
     found = Regressor.of(model, moved, slow)
     x = np.zeros((len(moved.time), model.nv, layout.size))
-    x[:, :, : layout.own(OWN[0])] = found.columns
-    x[:, :, layout.tilt], x[:, :, layout.known] = found.tilt, found.known
+    x[:, :, : layout.at(OWN[0])] = found.columns
+    x[:, :, [layout.at("tilt"), layout.at("tilt") + 1]], x[:, :, layout.at("known")] = found.tilt, found.known
     of = {"effort": drives.measured_forces(log, model), "ctrl": drives.commanded(drives.centred(log), model)}
     each = {name: drives.on_dofs(force, model) for name, force in of.items()}
     effort = np.where(np.array(source) == "effort", each["effort"], each["ctrl"])
     y = np.stack([filtered(effort[:, v], log, moved) for v in range(model.nv)], 1)
     for name, column in found.own.items():
-        x[:, :, layout.own(name)] = column
-    x[:, :, layout.own("effort_load")] = moved.smooth(np.abs(y) * found.dry)
+        x[:, :, layout.at(name)] = column
+    x[:, :, layout.at("effort_load")] = moved.smooth(np.abs(y) * found.dry)
     for v, column in _zeros(model, moved).items():
-        x[:, :, layout.zero(v)] = moved.smooth(column)
-    x[:, :, layout.effort], x[:, :, layout.late] = y, np.gradient(y, moved.step, axis=0)
+        x[:, :, layout.at("zero") + v] = moved.smooth(column)
+    x[:, :, layout.at("effort")], x[:, :, layout.at("late")] = y, np.gradient(y, moved.step, axis=0)
     for i in layout.shared:
         dof = drives.dof_of(model, i)
         if dof is not None and source[dof] in of:

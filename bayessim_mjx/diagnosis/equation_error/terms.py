@@ -51,8 +51,8 @@ def known(
     ):
         for v in map(int, np.flatnonzero(size > 0)):
             sd = accuracy.get((effect, joint_of(model, v)), ACCURACY)
-            out.append(_term(effect, joint_of(model, v), _map(layout, layout.own(own), v, float(size[v])), sd=sd))
-    return [*out, _term("lateness", "all", _map(layout, layout.late), sd=period)]
+            out.append(_term(effect, joint_of(model, v), _map(layout, layout.at(own), v, float(size[v])), sd=sd))
+    return [*out, _term("lateness", "all", _map(layout, layout.at("late")), sd=period)]
 
 
 def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carried: Array) -> list[Term]:
@@ -69,20 +69,20 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
     for effect in map(library.load, library.names()):
         if not effect.effort:
             continue
-        each, read = [_map(layout, layout.own(effect.effort), v) for v in joints], _reader(effect.quantities[0].name)
+        each, read = [_map(layout, layout.at(effect.effort), v) for v in joints], _reader(effect.quantities[0].name)
         out += [_term(effect.name, joint_of(model, v), m, read, low=0) for v, m in zip(joints, each, strict=True)]
         out += [_term(effect.name, "all", np.sum(each, 0), read, low=0)] if len(joints) > 1 else []
     for v in joints:
         name = joint_of(model, v)
-        load = np.stack([_map(layout, layout.own(n), v) for n in ("effort_load", "load")], -1)
+        load = np.stack([_map(layout, layout.at(n), v) for n in ("effort_load", "load")], -1)
         out.append(_term("load_friction", name, load, _reader("motor", "external"), low=0.0, high=1.0))
-        spring = np.stack([_map(layout, layout.own(n), v) for n in ("position", "one")], -1)
+        spring = np.stack([_map(layout, layout.at(n), v) for n in ("position", "one")], -1)
         out.append(_term("joint_spring", name, spring, _spring, low=np.array([0.0, -np.inf])))
         if np.any(model.jnt_type == 3):
-            zero, read = _map(layout, layout.zero(v)), _reader("offset", sign=-1.0)
+            zero, read = _map(layout, layout.at("zero") + v), _reader("offset", sign=-1.0)
             out.append(_term("joint_offset", name, zero, read, sd=_askew("joint_offset")))
     out += _on_actuators(model, layout, driven)
-    tilt = np.stack([_map(layout, c) for c in range(layout.tilt.start, layout.tilt.stop)], -1)
+    tilt = np.stack([_map(layout, c) for c in (layout.at("tilt"), layout.at("tilt") + 1)], -1)
     if np.any(model.opt.gravity):
         out.append(_term("gravity_tilt", "world", tilt, _reader("roll", "pitch"), sd=_askew("gravity_tilt")))
     return [*out, *payloads(model, layout, carried), *links(model, layout)]
@@ -95,9 +95,7 @@ def _on_actuators(model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[
         rest = np.sum(beside, axis=0) if beside else None
         out.append(scale("actuator_gain", title[i], np.arange(layout.nv) == v, SURE, rest))
         gear = float(model.actuator_gear[i, 0]) or 1.0
-        out.append(
-            _term("actuator_bias", title[i], _map(layout, layout.own("one"), v), _reader("bias", sign=-1 / gear))
-        )
+        out.append(_term("actuator_bias", title[i], _map(layout, layout.at("one"), v), _reader("bias", sign=-1 / gear)))
     if len(driven) > 1:
         on = np.isin(np.arange(layout.nv), [v for _, v in driven])
         out.append(scale("actuator_gain", "all", on, SURE))

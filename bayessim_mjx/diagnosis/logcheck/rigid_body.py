@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-BLOCK = 2000  # rows at a time: the memory that they take; results differ by rounding alone
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 INERTIAL = 1 + 3 + len(_PAIRS)  # parameters of a body: mass, first moments and inertia
 
@@ -171,8 +170,7 @@ def rigid(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array, sets: Ar
     own, parts = nominal(model), []
     acts = 1.0 - model.body_gravcomp[moving_bodies(model), None, None]  # share of gravity that the drives feel
     falls = [-np.cross(axis, gravity(model)) for axis in np.eye(3)[:2]]
-    for a in range(0, len(qpos), BLOCK):  # Jacobians of all rows of a long log would not fit into memory
-        rows = slice(a, a + BLOCK)
+    for rows in np.array_split(np.arange(len(qpos)), max(1, min(model.nv, len(qpos)))):  # all would fill the memory
         frames = Frames.of(model, qpos[rows], qvel[rows], qacc[rows])
         whole, down = frames.columns(), frames.weight(gravity(model))
         each = whole - (1.0 - acts) * down

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.equation_error.search import Proposal
-from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel
+from bayessim_mjx.diagnosis.logcheck.links import Channel
 from bayessim_mjx.diagnosis.phrases.effects import MOST, any_of, measured, titled
 from bayessim_mjx.quantities import listed, percent
 
