@@ -22,8 +22,8 @@ import numpy as np
 from counted_cases import Plan, frozen, make
 
 from bayessim_mjx.diagnosis.logcheck import drives, noise
-from bayessim_mjx.diagnosis.logcheck.drive_channel import channels_of
 from bayessim_mjx.diagnosis.logcheck.gate import check
+from bayessim_mjx.diagnosis.logcheck.links import channels_of
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Array, Log
@@ -92,8 +92,8 @@ def judged(plan: Plan, folder: Path) -> Iterator[dict[str, Any]]:
         related = [r for report in gate.reports for r in report.relations if r.explained is not None]
         yield about | {
             "fault": name, "count": len(some), "refused": gate.refused, "period": period,
-            "explained": [r.explained for r in related], "friction": [r.friction for r in related],
-            "lag": [(r.late.seconds, r.late.error, r.gain) for r in related],
+            "explained": [r.explained for r in related],
+            "lag": [(r.late.seconds, r.late.error, r.lag) for r in related],
             "remarks": [f.text for report in gate.reports for f in report.remarks],
             "velocities": [(v.slope, v.lag, v.correlation) for report in gate.reports for v in report.velocities],
             "noise free": [noise.noise_free(some, c) for c in range(model.nq)],
@@ -178,11 +178,9 @@ def table(rows: Sequence[dict[str, Any]]) -> None:
             "  explained, quantiles .01 .05 .5 .95 .99:", np.quantile(explained, [0.01, 0.05, 0.5, 0.95, 0.99]).round(3)
         )
         print(*(f"  below {level}: {share(list(explained < level))}" for level in (0.3, 0.5, 0.7)))
-        held = [(s, s - 0.5 * r["period"], e, g) for r in torque for s, e, g in r["lag"]]
-        for least in (0.0, 0.01, 0.02, 0.05):
-            print(f"  lag from a gain of {least}: {share([g >= least and s != 0 for s, _, e, g in held])}", end=";")
-        seen = [1e3 * late for s, late, e, g in held if g >= 0.02 and s]
-        print("\n  reported lag less half a row, ms:", np.quantile(seen, [0.05, 0.5, 0.95]).round(1) if seen else "")
+        print(f"  lag named: {share([named != 0 for r in torque for _, _, named in r['lag']])}")
+        seen = [1e3 * (named - 0.5 * r["period"]) for r in torque for _, _, named in r["lag"] if named]
+        print("  named lag less half a row, ms:", np.quantile(seen, [0.05, 0.5, 0.95]).round(1) if seen else "")
         usable = [
             abs(a - 1) < 0.1 and abs(t) <= 0.6 * r["period"] and c > 0.95 for r in own for a, t, c in r["velocities"]
         ]
@@ -205,7 +203,7 @@ def _late(rows: Sequence[dict[str, Any]]) -> None:
     before = {(r["case"], i): x for r in rows if r.get("fault") == "motion 50 ms late" for i, x in enumerate(r["lag"])}
     after = {(r["case"], i): x for r in rows if r.get("fault") == "motion 50 ms early" for i, x in enumerate(r["lag"])}
     own = [(before[k], after[k]) for k in before if k in after]
-    away = [(b[0] - a[0] - 0.1) / np.hypot(b[1], a[1]) for b, a in own if min(b[2], a[2]) >= 0.02 and b[1] > 0 < a[1]]
+    away = [(b[0] - a[0] - 0.1) / np.hypot(b[1], a[1]) for b, a in own if b[2] and a[2] and b[1] > 0 < a[1]]
     print(
         f"\n100 ms between two commands, error in standard errors ({len(away)}):", np.quantile(away, [0.05, 0.5, 0.95])
     )

@@ -1,7 +1,6 @@
 """Weighted least squares on sums of products: effort = scale (nominal + columns), with priors and signs.
 
-Each joint has its own error variance, found with the fit. Below a hundredth of a joint's effort nothing is told: so
-much the filters and derivatives are worth.
+Each joint has its own error variance, found with the fit.
 """
 
 from __future__ import annotations
@@ -12,24 +11,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.equation_error.sums import Sums
+from bayessim_mjx.diagnosis.equation_error.sums import Layout, Sums
 from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 from bayessim_mjx.diagnosis.statistics import times
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Rules:
-    """How a fit is made. Choices; that six rounds settle and a hundredth is the filters' error was not counted."""
-
-    floor: float = 0.01  # of a joint's root mean square effort
-    rounds: int = 6  # of a fit, in which variances, scales and places of loads settle
-    least: float = 1e-9  # precision of what has no prior, in units of its own column
-
-
-RULES = Rules()
-Shape = Callable[[Array], Array]  # coefficients [k] of the last round (NaN: none yet) -> maps [nv, P, k]
+# Of a joint's root mean square effort: so much the filters and derivatives are worth. A choice, not counted.
+FLOOR = 0.01
+# Precision of what has no prior, in units of its own column: products of columns have half the digits of a float64.
+LEAST = float(np.finfo(float).eps) ** 0.5
+Shape = Callable[[Array], Array]  # coefficients [k] of the last round -> maps [nv, P, k]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +35,7 @@ class Term:
         shape: its maps into the columns; a scale has none.
         scaled: `[nv]`, joints whose whole effort it scales (neutral 1); None: it adds (neutral 0).
         rest: `[nv, P]`, effort at these joints that it does not scale, y = rest + k (needed - rest); or None.
-        sd: coefficients of the last round (NaN: none yet) -> `[k]` of the priors; inf: none.
+        sd: coefficients of the last round -> `[k]` of the priors; inf: none.
         low, high: `[k]`, allowed coefficients; within: further limits.
         read: coefficients -> parameters of the effect.
     """
@@ -106,133 +100,74 @@ def _spans(terms: Sequence[Term]) -> list[slice]:
 def used(sums: Sums) -> NDArray[np.bool_]:
     """`[nv]`: joints whose effort is known and that moved."""
     known = np.array([s != "" for s in sums.source])
-    return known & (sums.rows.sum(0) >= FEWEST) & (sums.size > 0)
+    return known & (sums.rows >= FEWEST) & (sums.size > 0)
 
 
-def left(sums: Sums, gram: Array, model: Array) -> Array:
-    """`[nv]`, sums of squares of what a model leaves."""
+def left(sums: Sums, model: Array) -> Array:
+    """`[nv]`, mean squares of what a model leaves."""
     rest = -model
-    rest[:, sums.layout.effort] += 1.0
-    return np.asarray(np.maximum(np.sum(rest * times(gram, rest), -1), 0.0))
+    rest[:, sums.layout.at("effort")] += 1.0
+    return np.maximum(np.sum(rest * times(sums.gram, rest), -1), 0.0) / np.maximum(sums.rows, 1e-9)
 
 
-def fit(sums: Sums, terms: Sequence[Term], without: int | None = None, start: Array | None = None) -> Fit:
-    """Least squares of all terms together, on all parts but one.
-
-    Args:
-        start: variances `[nv]` to begin with; None: of the nominal model.
-    """
-    gram = sums.whole - (0 if without is None else sums.gram[without])
-    rows = np.maximum(sums.rows.sum(0) - (0 if without is None else sums.rows[without]), 1e-9)
-    on, lay = used(sums), sums.layout
-    floor = (RULES.floor * np.maximum(sums.size, 1e-12)) ** 2
-    spans, size = _spans(terms), sum(t.count for t in terms)
-    values = np.concatenate([np.full(t.count, np.nan if t.scaled is None else 1.0) for t in terms] or [np.zeros(0)])
-    nominal = np.zeros((lay.nv, lay.size))
-    nominal[:, lay.known] = 1.0
-    model, variance = nominal, left(sums, gram, nominal) / rows + floor if start is None else start
-    covariance = np.zeros((size, size))
-    neutral = np.concatenate([np.full(t.count, t.neutral) for t in terms] or [np.zeros(0)])
-    for _ in range(RULES.rounds):
-        design, target = _linearised(lay.effort, terms, spans, values, model, nominal)
-        weight = np.where(on, 1.0 / variance, 0.0)
-        rows_of = (lay.nv * lay.size, size)
+def fit(sums: Sums, terms: Sequence[Term]) -> Fit:
+    """Least squares of all terms together, by Gauss-Newton steps: a scale times a sum is not linear."""
+    on, spans, size = used(sums), _spans(terms), sum(t.count for t in terms)
+    floor = (FLOOR * np.maximum(sums.size, 1e-12)) ** 2
+    neutral, low, high = (
+        np.concatenate([np.broadcast_to(getattr(t, e), t.count) for t in terms] or [np.zeros(0)])
+        for e in ("neutral", "low", "high")
+    )
+    values, covariance = neutral, np.zeros((size, size))
+    model, design = _effort(sums.layout, terms, spans, values)
+    for _ in range(EFFORT.rounds):
+        rest = design @ values - model
+        rest[:, sums.layout.at("effort")] += 1.0
+        weight = np.where(on, 1.0 / (left(sums, model) + floor), 0.0)
+        rows_of = (model.size, size)
         weighed = (weight[:, None, None] * design).reshape(rows_of).T
-        H = weighed @ (gram @ design).reshape(rows_of)
-        g = weighed @ times(gram, target).ravel()
-        precision = _precision(np.diag(H), terms, spans, values)
-        H, g = H + np.diag(precision), g + neutral * precision
-        covariance = np.asarray(np.linalg.inv(H), np.float64)
-        values = covariance @ g
-        model = _model(terms, spans, values, nominal)
-        variance = left(sums, gram, model) / rows + floor
-    low, high = (np.concatenate([getattr(t, e) for t in terms] or [np.zeros(0)]) for e in ("low", "high"))
-    feasible = bool(np.all(values >= low - 1e-9) and np.all(values <= high + 1e-9))
+        H = weighed @ (sums.gram @ design).reshape(rows_of)
+        known = np.concatenate([1.0 / t.sd(values[own]) ** 2 for t, own in zip(terms, spans, strict=True)] or [neutral])
+        precision = known + LEAST * np.where(np.diag(H) > 0, np.diag(H), 1.0)
+        covariance = np.linalg.inv(H + np.diag(precision))
+        values = covariance @ (weighed @ times(sums.gram, rest).ravel() + neutral * precision)
+        model, design = _effort(sums.layout, terms, spans, values)
+    feasible = bool(np.all(values >= low - LEAST) and np.all(values <= high + LEAST))
     feasible = feasible and all(t.within(values[own]) for t, own in zip(terms, spans, strict=True))
-    sd = np.concatenate([t.sd(values[own]) for t, own in zip(terms, spans, strict=True)] or [np.zeros(0)])
+    sd = np.concatenate([t.sd(values[own]) for t, own in zip(terms, spans, strict=True)] or [neutral])
     penalty = 0.5 * float(np.sum(((values - neutral) / sd) ** 2))
-    return Fit(tuple(terms), values, covariance, model, variance, feasible, penalty)
+    return Fit(tuple(terms), values, covariance, model, left(sums, model) + floor, feasible, penalty)
 
 
-def _scales(terms: Sequence[Term], spans: Sequence[slice], values: Array, nv: int) -> Array:
-    """`[nv]`, by which the whole effort is multiplied."""
-    out = np.ones(nv)
+def _effort(layout: Layout, terms: Sequence[Term], spans: Sequence[slice], values: Array) -> tuple[Array, Array]:
+    """(effort `[nv, P]` as a map of the columns, its derivative `[nv, P, K]` by the coefficients)."""
+    inner, scale, rest = np.zeros((3, layout.nv, layout.size))
+    inner[:, layout.at("known")], scale[:] = 1.0, 1.0
+    design = np.zeros((*inner.shape, len(values)))
+    for term, own in zip(terms, spans, strict=True):
+        if term.shape is not None:
+            design[:, :, own] = term.shape(values[own])
+            inner += design[:, :, own] @ values[own]
+        elif term.scaled is not None:
+            scale[term.scaled] *= values[own][0]
+            rest += 0.0 if term.rest is None else (1.0 - values[own][0]) * term.rest
+    design *= scale[:, :, None]
     for term, own in zip(terms, spans, strict=True):
         if term.scaled is not None:
-            out[term.scaled] *= values[own][0]
-    return out
-
-
-def _model(terms: Sequence[Term], spans: Sequence[slice], values: Array, nominal: Array) -> Array:
-    inner = nominal.copy()
-    for term, own in zip(terms, spans, strict=True):
-        if term.shape is not None:
-            inner += term.shape(values[own]) @ values[own]
-    scale = _scales(terms, spans, values, len(nominal))[:, None]
-    return inner * scale + _rest(terms, spans, values, nominal)
-
-
-def _rest(terms: Sequence[Term], spans: Sequence[slice], values: Array, nominal: Array) -> Array:
-    """`[nv, P]`, what of the effort at the same joints comes beside what is scaled."""
-    out = np.zeros_like(nominal)
-    for term, own in zip(terms, spans, strict=True):
-        if term.rest is not None:
-            out += (1.0 - values[own][0]) * term.rest
-    return out
-
-
-def _linearised(
-    effort: int, terms: Sequence[Term], spans: Sequence[slice], values: Array, model: Array, nominal: Array
-) -> tuple[Array, Array]:
-    """(columns `[nv, P, K]`, target `[nv, P]`) near the last round's values: scale times sum is not linear."""
-    scale, rest = _scales(terms, spans, values, len(nominal)), _rest(terms, spans, values, nominal)
-    design = np.zeros((*nominal.shape, len(values)))
-    target = -nominal * scale[:, None] - rest
-    target[:, effort] += 1.0
-    for term, own in zip(terms, spans, strict=True):
-        if term.shape is not None:
-            design[:, :, own] = term.shape(values[own]) * scale[:, None, None]
-        elif term.scaled is not None:
-            # y = k m(p): y - k0 nominal + (k0 m0) = k0 M p + (k / k0) (k0 m0), of the part that this scale acts on
-            design[term.scaled, :, own.start] = (model - rest)[term.scaled] / values[own][0]
+            design[term.scaled, :, own.start] = (inner * scale)[term.scaled] / values[own][0]
             design[:, :, own.start] -= 0.0 if term.rest is None else term.rest
-            target += values[own][0] * design[:, :, own.start]
-    return design, target
-
-
-def _precision(size: Array, terms: Sequence[Term], spans: Sequence[slice], values: Array) -> Array:
-    """`[K]` of the priors; what has none gets one that only keeps the matrix regular."""
-    out = RULES.least * np.where(size > 0, size, 1.0)
-    for term, own in zip(terms, spans, strict=True):
-        out[own] += 1.0 / term.sd(values[own]) ** 2
-    return out
+    return inner * scale + rest, design
 
 
 def contribution(sums: Sums, found: Fit, term: Term) -> Array:
     """`[nv]`, root mean square of what a term adds to the effort, as a share of it."""
     values = found.values.copy()
     values[found.at(term)] = term.neutral
-    nominal = np.zeros_like(found.model)
-    nominal[:, sums.layout.known] = 1.0
-    away = found.model - _model(found.terms, _spans(found.terms), values, nominal)
-    power = np.sum(away * times(sums.whole, away), -1) / np.maximum(sums.rows.sum(0), 1e-9)
+    away = found.model - _effort(sums.layout, found.terms, _spans(found.terms), values)[0]
+    power = np.sum(away * times(sums.gram, away), -1) / np.maximum(sums.rows, 1e-9)
     return np.where(used(sums), np.sqrt(np.maximum(power, 0.0)) / np.maximum(sums.size, 1e-300), 0.0)
 
 
-def score(sums: Sums, terms: Sequence[Term], start: Array | None = None) -> Array:
-    """`[F]`, log density of each part's effort as predicted by a fit to the others, up to a constant."""
-    on, out = used(sums), np.zeros(len(sums.gram))
-    for part in range(len(sums.gram)):
-        own = fit(sums, terms, without=part, start=start)
-        rest = left(sums, sums.gram[part], own.model)
-        out[part] = -0.5 * float(
-            np.sum(np.where(on, rest / own.variance + sums.rows[part] * np.log(own.variance), 0.0))
-        )
-        out[part] -= own.penalty / len(out)
-    return out
-
-
 def evidence(sums: Sums, found: Fit) -> float:
-    """Log density of all efforts and priors at the fit: what ranks terms before any part is held out."""
-    density = np.where(used(sums), sums.rows.sum(0) * np.log(found.variance), 0.0)
-    return -0.5 * float(np.sum(density)) - found.penalty
+    """Log density of all efforts and priors at the fit, up to a constant."""
+    return -0.5 * float(np.sum(np.where(used(sums), sums.rows * np.log(found.variance), 0.0))) - found.penalty

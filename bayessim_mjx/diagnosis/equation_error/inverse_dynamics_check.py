@@ -5,6 +5,7 @@ The search leaves out candidates that the efforts contradict, and begins others 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,30 +20,19 @@ from bayessim_mjx.diagnosis.equation_error import fit as fitting
 from bayessim_mjx.diagnosis.equation_error import sums as summing
 from bayessim_mjx.diagnosis.equation_error import terms
 from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term, used
-from bayessim_mjx.diagnosis.equation_error.search import Found, Proposal, contradicted, search
+from bayessim_mjx.diagnosis.equation_error.search import STRONG, Found, Proposal, contradicted, search
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, base_coordinates
 from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.logcheck import drives, gate, rigid_body
-from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel, channels_of
+from bayessim_mjx.diagnosis.logcheck import drives, gate
+from bayessim_mjx.diagnosis.logcheck.links import Channel, channels_of
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
 UNITS = ("N m", "Nm", "N")  # of efforts, as metadata may state them: those of the model's actuators
 
 
-@dataclass(frozen=True)
-class Limits:
-    """What counts as the model's unit, as a shift of a parameter, as identifiable. Rules of thumb, not counted."""
-
-    unit: float = 0.15  # efforts that are within this factor of the model's need are in its unit
-    far: float = 2.0  # standard deviations of the data sheet's, from where on a known parameter's shift is told
-    places: int = 20  # positions of each log at which drives hold loads
-    rank: float = 1e-7  # of the largest singular value squared, columns at unit length
-    shown: float = 0.7  # of what the data sheet leaves open: a mass whose deviation stays above this is not told
-
-
-LIMITS = Limits()
+FAR = math.sqrt(2 * STRONG)  # standard deviations of the data sheet's, at which the odds for it are strong no more
 
 
 @dataclass(frozen=True)
@@ -75,21 +65,6 @@ class Shift:
     away: float
 
 
-@dataclass(frozen=True)
-class Told:
-    """What the motion shows of the inertial parameters.
-
-    Attributes:
-        parameters: of all moving bodies; combinations: of them that act on the known efforts in these logs (base
-            parameters, Gautier 1991, by eigenvalues of the regressor's products).
-        unknown: bodies whose mass these logs do not tell better than the data sheet.
-    """
-
-    parameters: int
-    combinations: int
-    unknown: tuple[str, ...]
-
-
 @dataclass(frozen=True, eq=False)
 class Look:
     """What was seen.
@@ -100,7 +75,8 @@ class Look:
         proposals: effects that the efforts call for; explained: share that they and the known parameters explain of
             the squared effort that the model leaves.
         shifts: known parameters that move with the proposals; of those that hardly move nothing is said.
-        vetoes: {label of a candidate: why it is contradicted}; told: what of the inertial parameters shows.
+        vetoes: {label of a candidate: why it is contradicted}.
+        unknown: bodies whose mass these logs tell less of than the data sheet.
     """
 
     channels: tuple[Channel, ...] = ()
@@ -110,7 +86,7 @@ class Look:
     explained: float = float("nan")
     shifts: tuple[Shift, ...] = ()
     vetoes: Mapping[str, str] = field(default_factory=dict)
-    identifiability: Told | None = None
+    unknown: tuple[str, ...] = ()
     seconds: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
@@ -124,8 +100,7 @@ class Look:
         return {
             "channels": [vars(c) for c in self.channels], "joints": [vars(j) for j in self.joints], "unit": self.unit,
             "proposals": rows, "explained": self.explained, "shifts": [vars(s) for s in self.shifts],
-            "contradicted": dict(self.vetoes), "seconds": self.seconds,
-            "inertial": vars(self.identifiability) if self.identifiability else {},
+            "contradicted": dict(self.vetoes), "seconds": self.seconds, "inertial": {"unknown": self.unknown},
         }  # fmt: skip
 
 
@@ -146,8 +121,8 @@ def check(
     if not used(sums).any():
         return Look(seconds=time.monotonic() - began)
     known = terms.known(model, sums.layout, accuracy or {}, sums.period)
-    places = np.concatenate([log.qpos[:: max(1, len(log) // LIMITS.places)] for log in logs])
-    carried = data_sheet.rated(drives.carried(model, places), rating or {})
+    places = [log.qpos for log in summing.shortened(logs)]
+    carried = data_sheet.rated(drives.carried(model, np.concatenate(places)), rating or {})
     offered = terms.effects(model, sums.layout, sums.source, carried)
     stated = all(str(log.metadata.get("effort_unit", "")) in UNITS for log in logs)
     found, unit = _searched(sums, known, offered, stated)
@@ -163,7 +138,7 @@ def check(
         _explained(sums, nominal, found),
         _shifts(known, found.fit),
         vetoes,
-        told_by(model, sums, known, found.fit),
+        _unknown(known, found.fit),
         time.monotonic() - began,
     )
 
@@ -177,7 +152,7 @@ def _searched(sums: Sums, known: Sequence[Term], offered: Sequence[Term], stated
     others = [t for t in offered if (t.effect, t.where) != ("actuator_gain", "all")]
     found = search(sums, [*known, unit], others)
     factor = 1.0 / float(found.fit.of(unit)[0])
-    if abs(np.log(abs(factor) + 1e-12)) < LIMITS.unit:
+    if abs(np.log(abs(factor) + 1e-12)) < terms.SURE:
         return search(sums, known, offered), 1.0
     return found, factor
 
@@ -185,15 +160,15 @@ def _searched(sums: Sums, known: Sequence[Term], offered: Sequence[Term], stated
 def _joints(model: mujoco.MjModel, sums: Sums, nominal: Fit, found: Found) -> tuple[Joint, ...]:
     lay, on = sums.layout, used(sums)
     size = sums.size
-    whole, rows = sums.whole, np.maximum(sums.rows.sum(0), 1e-9)
+    whole = sums.gram
     parts = [
-        np.sqrt(fitting.left(sums, whole, m) / rows) / np.maximum(size, 1e-300)
+        np.sqrt(fitting.left(sums, m)) / np.maximum(size, 1e-300)
         for m in (nominal.model, found.base.model, found.fit.model)
     ]
     out = []
     for v in np.flatnonzero(on):
-        needed = float(whole[v, lay.known, lay.known])
-        ratio = float(whole[v, lay.known, lay.effort]) / needed if needed > 0 else float("nan")
+        needed = float(whole[v, lay.at("known"), lay.at("known")])
+        ratio = float(whole[v, lay.at("known"), lay.at("effort")]) / needed if needed > 0 else float("nan")
         ratio = ratio if sums.source[v] != "none" else float("nan")
         out.append(Joint(terms.joint_of(model, int(v)), sums.source[v], ratio, *(float(p[v]) for p in parts)))
     return tuple(out)
@@ -205,7 +180,7 @@ def _shifts(known: Sequence[Term], found: Fit) -> tuple[Shift, ...]:
     for term in (t for t in known if t.effect != "lateness"):
         share = float(found.of(term)[0])
         away = share / float(term.sd(found.of(term))[0])
-        if abs(away) > LIMITS.far:
+        if abs(away) > FAR:
             out.append(Shift(term.effect, term.where, share, away))
     return tuple(sorted(out, key=lambda s: -abs(s.away)))
 
@@ -213,27 +188,14 @@ def _shifts(known: Sequence[Term], found: Fit) -> tuple[Shift, ...]:
 def _explained(sums: Sums, nominal: Fit, found: Found) -> float:
     """Share that is explained of the squared effort that the model leaves, each joint in units of its own effort."""
     size, on = sums.size, used(sums)
-    rows = np.maximum(sums.rows.sum(0), 1e-9)
-    before, after = (
-        float(np.sum((fitting.left(sums, sums.whole, f.model) / rows / size**2)[on])) for f in (nominal, found.fit)
-    )
+    before, after = (float(np.sum((fitting.left(sums, f.model) / size**2)[on])) for f in (nominal, found.fit))
     return 1.0 - after / before if before > 0 and found.proposals else float("nan")
 
 
-def told_by(model: mujoco.MjModel, sums: Sums, known: Sequence[Term], found: Fit) -> Told:
-    """From the products of the columns, and from the fit's covariance."""
-    count = rigid_body.INERTIAL * sums.layout.bodies
-    weight = np.where(used(sums), 1.0 / found.variance, 0.0)
-    S = np.einsum("v,vpq->pq", weight, sums.whole[:, :count, :count])
-    size = np.sqrt(np.diag(S))
-    seen = size > 1e-6 * size.max(initial=1e-300)
-    scaled = S[np.ix_(seen, seen)] / np.outer(size[seen], size[seen])
-    values = np.linalg.eigvalsh(scaled) if seen.any() else np.zeros(0)
-    rank = int(np.sum(values > LIMITS.rank * values.max(initial=1e-300)))
-    masses = [t for t in known if t.effect == "mass"]
-    nothing = np.full(1, np.nan)
-    unknown = [t.where for t in masses if found.deviation(t)[0] > LIMITS.shown * t.sd(nothing)[0]]
-    return Told(count, rank, tuple(unknown))
+def _unknown(known: Sequence[Term], found: Fit) -> tuple[str, ...]:
+    """Bodies of whose mass the logs have less information (1 / variance) than the data sheet."""
+    masses = [(t.where, found.deviation(t)[0], t.sd(found.of(t))[0]) for t in known if t.effect == "mass"]
+    return tuple(where for where, after, before in masses if 1 / after**2 - 1 / before**2 < 1 / before**2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,31 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
-from bayessim_mjx.diagnosis.logcheck.regressor import SLOW, Mask, Motion, Regressor, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.regressor import Mask, Motion, Regressor, filtered, motion
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
 OWN = ("acceleration", "speed", "dry", "drag", "position", "one", "load", "effort_load")
-SHIFT = 1e-4  # rad or m, for the derivative by a joint's zero: exact to rounding, which costs 1e-12 of it
-
-
-@dataclass(frozen=True)
-class Budget:
-    """How much is looked at, and in how many parts logs are held out: seconds, not errors. Choices, not counted."""
-
-    rows: int = 12000  # of all logs together, at their own rates
-    folds: int = 3  # with fewer logs, each is cut into parts
-    parts: int = 4
-    most: int = 12  # parts of all logs together: those of more logs are held out side by side
-    many: int = 16  # dofs, beyond which zeros of joints are not looked at
-
-
-BUDGET = Budget()
+SHIFT = float(np.finfo(float).eps) ** (1 / 3)  # rad or m, of a central difference: rounding and curvature cost as much
+ROWS = 12000  # of all logs together, at their own rates: seconds, not errors; a choice, not counted
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the columns stand: ten of each body, the joint's own (OWN), zeros [nv], drives, tilt, late, known, effort.
+    """Where the columns stand: ten of each body, the joint's own (OWN), zeros `[nv]`, drives, tilt [2], and others.
 
     shared: actuators that drive a joint together with others; each has a column of its own effort.
     """
@@ -45,47 +31,34 @@ class Layout:
     nv: int
     shared: tuple[int, ...] = ()
 
+    @cached_property
+    def _starts(self) -> dict[str, int]:
+        kinds = {"body": rigid_body.INERTIAL * self.bodies} | dict.fromkeys(OWN, 1)
+        kinds |= {"zero": self.nv, "drive": len(self.shared), "tilt": 2, "late": 1, "known": 1, "effort": 1, "end": 0}
+        return dict(zip(kinds, np.cumsum([0, *kinds.values()]).tolist(), strict=False))
+
     @property
     def size(self) -> int:
-        return rigid_body.INERTIAL * self.bodies + len(OWN) + self.nv + len(self.shared) + 5
+        return self.at("end")
+
+    def at(self, kind: str) -> int:
+        """The (first) column of one of OWN, or of zero, tilt, late, known (what the model says) and effort."""
+        return self._starts[kind]
 
     def body(self, i: int) -> slice:
         return slice(rigid_body.INERTIAL * i, rigid_body.INERTIAL * (i + 1))
 
-    def own(self, name: str) -> int:
-        return rigid_body.INERTIAL * self.bodies + OWN.index(name)
-
-    def zero(self, dof: int) -> int:
-        return rigid_body.INERTIAL * self.bodies + len(OWN) + dof
-
     def drive(self, actuator: int) -> int:
         """Of one of the actuators `shared`."""
-        return rigid_body.INERTIAL * self.bodies + len(OWN) + self.nv + self.shared.index(actuator)
-
-    @property
-    def tilt(self) -> slice:
-        return slice(self.size - 5, self.size - 3)
-
-    @property
-    def late(self) -> int:
-        return self.size - 3
-
-    @property
-    def known(self) -> int:
-        """What the nominal model says."""
-        return self.size - 2
-
-    @property
-    def effort(self) -> int:
-        return self.size - 1
+        return self.at("drive") + self.shared.index(actuator)
 
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Products of the columns, `gram` `[F, nv, P, P]` by parts, each row counted as so many independent ones.
+    """Products of the columns, each row counted as so many independent ones.
 
     Attributes:
-        rows: `[F, nv]`, independent rows; source: `[nv]`, where the effort comes from (`sources`).
+        gram: `[nv, P, P]`; rows: `[nv]`, independent rows; source: `[nv]`, where the effort comes from (`sources`).
         period: s between the logs' rows.
     """
 
@@ -95,20 +68,15 @@ class Sums:
     source: tuple[str, ...]
     period: float
 
-    @cached_property
-    def whole(self) -> Array:
-        """`[nv, P, P]` of all parts."""
-        return np.asarray(self.gram.sum(0))
-
     def power(self, column: int) -> Array:
         """`[nv]`, mean square of a column."""
-        return np.asarray(self.whole[:, column, column] / np.maximum(self.rows.sum(0), 1e-9))
+        return np.asarray(self.gram[:, column, column] / np.maximum(self.rows, 1e-9))
 
     @cached_property
     def size(self) -> Array:
         """`[nv]`, rms of the effort, measured or needed; where nothing drives a joint, of what acts on it."""
         lay = self.layout
-        return np.sqrt(np.max([self.power(c) for c in (lay.effort, lay.known, lay.own("load"))], axis=0))
+        return np.sqrt(np.max([self.power(c) for c in (lay.at("effort"), lay.at("known"), lay.at("load"))], axis=0))
 
 
 def sources(log: Log, model: mujoco.MjModel) -> tuple[str, ...]:
@@ -150,19 +118,18 @@ def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Arra
     moved, layout = motion(log, model), layout_of(model)
     found = Regressor.of(model, moved, slow)
     x = np.zeros((len(moved.time), model.nv, layout.size))
-    x[:, :, : layout.own(OWN[0])] = found.columns
-    x[:, :, layout.tilt], x[:, :, layout.known] = found.tilt, found.known
+    x[:, :, : layout.at(OWN[0])] = found.columns
+    x[:, :, [layout.at("tilt"), layout.at("tilt") + 1]], x[:, :, layout.at("known")] = found.tilt, found.known
     of = {"effort": drives.measured_forces(log, model), "ctrl": drives.commanded(drives.centred(log), model)}
     each = {name: drives.on_dofs(force, model) for name, force in of.items()}
     effort = np.where(np.array(source) == "effort", each["effort"], each["ctrl"])
     y = np.stack([filtered(effort[:, v], log, moved) for v in range(model.nv)], 1)
     for name, column in found.own.items():
-        x[:, :, layout.own(name)] = column
-    x[:, :, layout.own("effort_load")] = moved.smooth(np.abs(y) * found.dry)
-    if model.nv <= BUDGET.many:
-        for v, column in _zeros(model, moved).items():
-            x[:, :, layout.zero(v)] = moved.smooth(column)
-    x[:, :, layout.effort], x[:, :, layout.late] = y, np.gradient(y, moved.step, axis=0)
+        x[:, :, layout.at(name)] = column
+    x[:, :, layout.at("effort_load")] = moved.smooth(np.abs(y) * found.dry)
+    for v, column in _zeros(model, moved).items():
+        x[:, :, layout.at("zero") + v] = moved.smooth(column)
+    x[:, :, layout.at("effort")], x[:, :, layout.at("late")] = y, np.gradient(y, moved.step, axis=0)
     for i in layout.shared:
         dof = drives.dof_of(model, i)
         if dof is not None and source[dof] in of:
@@ -189,28 +156,16 @@ def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
     each = [sources(log, model) for log in logs]
     source = tuple(_common(s) for s in zip(*each, strict=True))
     layout = layout_of(model)
-    short = _shortened(logs)
+    short = shortened(logs)
     top = np.max([np.percentile(np.abs(log.qvel), 95, axis=0) for log in short], axis=0)
-    grams, rows = [], []
-    parts = BUDGET.parts if len(short) < BUDGET.folds else 1
+    gram, rows = np.zeros((model.nv, layout.size, layout.size)), np.zeros(model.nv)
     for log in short:
-        x, moving, share = columns(log, model, source, SLOW * top + 1e-12)
-        for part in np.array_split(np.arange(len(x)), parts):
-            gram = np.zeros((model.nv, layout.size, layout.size))
-            count = np.zeros(model.nv)
-            for v in range(model.nv):
-                own = x[part[moving[v, part]], v]
-                gram[v], count[v] = share * own.T @ own, share * len(own)
-            grams.append(gram)
-            rows.append(count)
-    period = float(np.median([log.period for log in logs]))
-    return Sums(layout, _in_parts(grams), _in_parts(rows), source, period)
-
-
-def _in_parts(each: Sequence[Array]) -> Array:
-    """Sums of neighbours, at most `BUDGET.most`."""
-    ends = np.linspace(0, len(each), min(len(each), BUDGET.most) + 1).round().astype(int)
-    return np.array([np.sum(each[a:b], 0) for a, b in itertools.pairwise(ends)])
+        x, moving, share = columns(log, model, source, drives.LEAST * top + 1e-12)
+        for v in range(model.nv):
+            own = x[moving[v], v]
+            gram[v] += share * own.T @ own
+            rows[v] += share * len(own)
+    return Sums(layout, gram, rows, source, float(np.median([log.period for log in logs])))
 
 
 def _common(each: Sequence[str]) -> str:
@@ -220,9 +175,9 @@ def _common(each: Sequence[str]) -> str:
     return "ctrl" if set(each) == {"ctrl", "effort"} else ""
 
 
-def _shortened(logs: Sequence[Log]) -> list[Log]:
+def shortened(logs: Sequence[Log]) -> list[Log]:
     """The middle parts of logs that are too long together."""
-    share = BUDGET.rows / max(sum(len(log) for log in logs), 1)
+    share = ROWS / max(sum(len(log) for log in logs), 1)
     if share >= 1:
         return list(logs)
     spans = [(len(log), max(int(share * len(log)), min(len(log), 200))) for log in logs]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -11,40 +10,25 @@ from numpy.typing import NDArray
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY
-from bayessim_mjx.diagnosis.equation_error.fit import Term
+from bayessim_mjx.diagnosis.equation_error.fit import LEAST, Term
 from bayessim_mjx.diagnosis.equation_error.sums import Layout
 from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of
-from bayessim_mjx.diagnosis.logcheck.regressor import TILT
 from bayessim_mjx.effects.support.site import element_names
 
 Array = NDArray[np.float64]
 Reader = Callable[[Array], Mapping[str, float]]  # coefficients -> parameters of the effect
 
 
-@dataclass(frozen=True)
-class Ranges:
-    """What is taken for possible, and how well drives and mountings are known before anything is logged.
-
-    Torque constants and current loops to a fifth, zeros of joints and the upright of a base to three degrees. These
-    are rules of thumb: a gain of .4 or a zero that is 7 degrees off has to show more than rotor inertia that a model
-    leaves out.
-    """
-
-    gain: tuple[float, float] = (0.2, 3.0)
-    sure: float = 0.2  # standard deviation of a gain's inverse
-    zero: float = 0.05  # rad, standard deviation of a joint's zero and of a base's tilt
-    share: float = 1.0  # of the load that dry friction may be
-    late: float = 3.0  # periods: standard deviation of how late efforts are
-
-
-RANGES = Ranges()
+# Standard deviation of a gain's inverse: torque constants and current loops are known to a fifth, so that a gain of .4
+# has to show more than rotor inertia that a model leaves out. A rule of thumb, not counted.
+SURE = 0.2
 
 
 def known(
     model: mujoco.MjModel, layout: Layout, accuracy: Mapping[tuple[str, str], float], period: float
 ) -> list[Term]:
-    """Masses, rotor inertias, damping and friction as accurate as they are known; and how late efforts are.
+    """Masses, rotor inertias, damping and friction as accurate as they are known; and how late efforts are, to a row.
 
     Args:
         accuracy: {(mass, armature, damping or friction; element): standard deviation as a share}; of others, a
@@ -59,19 +43,16 @@ def known(
         if nominal[i, 0] > 0:
             name = element_names(model, "body")[body]
             sd = accuracy.get(("mass", name), ACCURACY)
-            out.append(_fixed("mass", name, np.tile(column, (layout.nv, 1)), sd=sd))
+            out.append(_term("mass", name, np.tile(column, (layout.nv, 1)), sd=sd))
     for effect, own, size in (
         ("armature", "acceleration", model.dof_armature),
         ("damping", "speed", model.dof_damping),
         ("friction", "dry", model.dof_frictionloss),
     ):
         for v in map(int, np.flatnonzero(size > 0)):
-            one = _one(layout, v, layout.own(own), float(size[v]))
             sd = accuracy.get((effect, joint_of(model, v)), ACCURACY)
-            out.append(_fixed(effect, joint_of(model, v), one, sd=sd))
-    late = np.zeros((layout.nv, layout.size))
-    late[:, layout.late] = 1.0
-    return [*out, _fixed("lateness", "all", late, sd=RANGES.late * period)]
+            out.append(_term(effect, joint_of(model, v), _map(layout, layout.at(own), v, float(size[v])), sd=sd))
+    return [*out, _term("lateness", "all", _map(layout, layout.at("late")), sd=period)]
 
 
 def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carried: Array) -> list[Term]:
@@ -88,39 +69,36 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
     for effect in map(library.load, library.names()):
         if not effect.effort:
             continue
-        each, read = [_one(layout, v, layout.own(effect.effort)) for v in joints], _reader(effect.quantities[0].name)
-        out += [_fixed(effect.name, joint_of(model, v), m, low=0, read=read) for v, m in zip(joints, each, strict=True)]
-        out += [_fixed(effect.name, "all", np.sum(each, 0), low=0, read=read)] if len(joints) > 1 else []
+        each, read = [_map(layout, layout.at(effect.effort), v) for v in joints], _reader(effect.quantities[0].name)
+        out += [_term(effect.name, joint_of(model, v), m, read, low=0) for v, m in zip(joints, each, strict=True)]
+        out += [_term(effect.name, "all", np.sum(each, 0), read, low=0)] if len(joints) > 1 else []
     for v in joints:
-        load = np.stack([_one(layout, v, layout.own(n)) for n in ("effort_load", "load")], -1)
-        out.append(_wide("load_friction", joint_of(model, v), load, 0.0, RANGES.share, _reader("motor", "external")))
-        spring = np.stack([_one(layout, v, layout.own(n)) for n in ("position", "one")], -1)
-        bounds = np.array([0.0, -np.inf]), np.inf
-        out.append(_wide("joint_spring", joint_of(model, v), spring, *bounds, _spring))
+        name = joint_of(model, v)
+        load = np.stack([_map(layout, layout.at(n), v) for n in ("effort_load", "load")], -1)
+        out.append(_term("load_friction", name, load, _reader("motor", "external"), low=0.0, high=1.0))
+        spring = np.stack([_map(layout, layout.at(n), v) for n in ("position", "one")], -1)
+        out.append(_term("joint_spring", name, spring, _spring, low=np.array([0.0, -np.inf])))
         if np.any(model.jnt_type == 3):
-            zero = _everywhere(layout, layout.zero(v))
-            read = _reader("offset", sign=-1.0)
-            out.append(_fixed("joint_offset", joint_of(model, v), zero, sd=RANGES.zero, read=read))
+            zero, read = _map(layout, layout.at("zero") + v), _reader("offset", sign=-1.0)
+            out.append(_term("joint_offset", name, zero, read, sd=_askew("joint_offset")))
     out += _on_actuators(model, layout, driven)
-    tilt = np.stack([_everywhere(layout, c) for c in range(layout.tilt.start, layout.tilt.stop)], -1)
+    tilt = np.stack([_map(layout, c) for c in (layout.at("tilt"), layout.at("tilt") + 1)], -1)
     if np.any(model.opt.gravity):
-        ends = -TILT, TILT
-        out.append(_wide("gravity_tilt", "world", tilt, *ends, _reader("roll", "pitch"), sd=RANGES.zero))
+        out.append(_term("gravity_tilt", "world", tilt, _reader("roll", "pitch"), sd=_askew("gravity_tilt")))
     return [*out, *payloads(model, layout, carried), *links(model, layout)]
 
 
 def _on_actuators(model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[int, int]]) -> list[Term]:
     out, title = [], element_names(model, "actuator")
     for i, v in driven:
-        beside = [_one(layout, v, layout.drive(j)) for j, w in driven if w == v and j != i]
+        beside = [_map(layout, layout.drive(j), v) for j, w in driven if w == v and j != i]
         rest = np.sum(beside, axis=0) if beside else None
-        out.append(scale("actuator_gain", title[i], np.arange(layout.nv) == v, RANGES.sure, rest))
+        out.append(scale("actuator_gain", title[i], np.arange(layout.nv) == v, SURE, rest))
         gear = float(model.actuator_gear[i, 0]) or 1.0
-        bias = _one(layout, v, layout.own("one"))
-        out.append(_fixed("actuator_bias", title[i], bias, read=_reader("bias", sign=-1.0 / gear)))
+        out.append(_term("actuator_bias", title[i], _map(layout, layout.at("one"), v), _reader("bias", sign=-1 / gear)))
     if len(driven) > 1:
         on = np.isin(np.arange(layout.nv), [v for _, v in driven])
-        out.append(scale("actuator_gain", "all", on, RANGES.sure))
+        out.append(scale("actuator_gain", "all", on, SURE))
     return out
 
 
@@ -131,10 +109,14 @@ def scale(effect: str, where: str, on: NDArray[np.bool_], sd: float = np.inf, re
         sd: of 1 / gain about 1, as far as that is known beforehand.
         rest: `[nv, P]`, the effort of other drives at the same joint, which acts as it was logged; None: there is none.
     """
-    low, high = 1.0 / RANGES.gain[1], 1.0 / RANGES.gain[0]
     read: Callable[[Array], Mapping[str, float]] = lambda c: {"gain": 1.0 / float(c[0])}  # noqa: E731
-    believed, lowest, highest = np.array([sd]), np.array([low]), np.array([high])
-    return Term(effect, where, None, scaled=on, sd=lambda c: believed, low=lowest, high=highest, read=read, rest=rest)
+    believed, least = np.array([sd]), np.array([LEAST])
+    return Term(effect, where, None, scaled=on, sd=lambda c: believed, low=least, read=read, rest=rest)
+
+
+def _askew(effect: str) -> float:
+    """Standard deviation of an angle [rad] whose usual range is two of them either way."""
+    return library.load(effect).quantities[0].high / 2
 
 
 def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term]:
@@ -169,7 +151,7 @@ def links(model: mujoco.MjModel, layout: Layout) -> list[Term]:
         shape[:, own, 3] = rigid_body.inertial(0.0, centre, axes @ np.diag(model.body_inertia[body]) @ axes.T)
         sd = np.array([*(q.deviation * drives.size(model, body) for q in places), inertia.deviation])
         name = element_names(model, "body")[body]
-        out.append(_wide("inertial_parameters", name, shape, -np.inf, np.inf, _link, sd=sd))
+        out.append(_term("inertial_parameters", name, shape, _link, sd=sd))
     return out
 
 
@@ -216,14 +198,14 @@ def _load(layout: Layout, body: int, centre: Array, turn: Array) -> Callable[[Ar
 
 def _place(c: Array) -> Array:
     """m, `[3]` from the body's centre of mass."""
-    return c[1:] / c[0] if np.isfinite(c).all() and c[0] > 0 else np.zeros(3)
+    return c[1:] / c[0] if c[0] > 0 else np.zeros(3)
 
 
 def _spread(most: float, reach: float) -> Callable[[Array], Array]:
     """What the logs do not tell of a load's place stays near the body's own centre."""
 
     def sd(last: Array) -> Array:
-        mass = last[0] if np.isfinite(last[0]) and last[0] > 0 else most
+        mass = last[0] if last[0] > 0 else most
         return np.array([np.inf, *(3 * [max(mass, 1e-3 * most) * reach / 2])])
 
     return sd
@@ -251,36 +233,24 @@ def joint_of(model: mujoco.MjModel, dof: int) -> str:
     return element_names(model, "joint")[model.dof_jntid[dof]]
 
 
-def _one(layout: Layout, dof: int, column: int, size: float = 1.0) -> Array:
-    """`[nv, P]`, one column at one dof."""
+def _map(layout: Layout, column: int, dof: int | slice = slice(None), size: float = 1.0) -> Array:
+    """`[nv, P]`, one column, at one dof or at all."""
     out = np.zeros((layout.nv, layout.size))
     out[dof, column] = size
     return out
 
 
-def _everywhere(layout: Layout, column: int) -> Array:
-    out = np.zeros((layout.nv, layout.size))
-    out[:, column] = 1.0
-    return out
-
-
-def _fixed(
-    effect: str, where: str, column: Array, low: float = -np.inf, sd: float = np.inf, read: Reader = lambda c: {}
-) -> Term:
-    """A term of one coefficient and one map `[nv, P]`."""
-    return _wide(effect, where, column[:, :, None], low, np.inf, read, sd)
-
-
-def _wide(
+def _term(
     effect: str,
     where: str,
     maps: Array,
-    low: float | Array,
-    high: float | Array,
-    read: Reader,
+    read: Reader = lambda c: {},
+    low: float | Array = -np.inf,
+    high: float = np.inf,
     sd: float | Array = np.inf,
 ) -> Term:
-    """A term of several coefficients and maps `[nv, P, k]`."""
+    """A term of one map `[nv, P]` or several `[nv, P, k]`, each with a coefficient."""
+    maps = maps.reshape(*maps.shape[:2], -1)
     k = maps.shape[-1]
-    least, most, believed = (np.broadcast_to(x, (k,)).astype(float) for x in (low, high, sd))
+    least, most, believed = (np.broadcast_to(x, k).astype(float) for x in (low, high, sd))
     return Term(effect, where, lambda c: maps, k, sd=lambda c: believed, low=least, high=most, read=read)

@@ -12,7 +12,7 @@ from bayessim_mjx.diagnosis.logcheck import effort, single_log
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort, looped
 from bayessim_mjx.diagnosis.logcheck.effort import Relation
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding
-from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing, offsets, pooled
+from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing, pooled
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import Velocity, agreeing, velocities
@@ -136,8 +136,7 @@ def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
     usable = [r for r in reports if r.usable]
     seen = [v for r in usable for v in r.velocities]
     first = [(e.joint, e.late) for r in usable for e in _first(r.relations)]
-    efforts = pooled(own for r in usable if not r.log.lost for own in offsets(r.log, mj_model))
-    timing = Timing(pooled((v.channel, Late(v.lag)) for v in seen), pooled(first), efforts)
+    timing = Timing(pooled((v.channel, Late(v.lag)) for v in seen), pooled(first))
     return Gate(reports, agreeing(seen, max([dt, *(r.log.period for r in usable)])), timing)
 
 
@@ -180,7 +179,7 @@ def _targets(log: Log, mj_model: mujoco.MjModel) -> dict[str, Array]:
 
 def _vouched(log: Log, mj_model: mujoco.MjModel, related: Sequence[Relation], targets: Mapping[str, Array]) -> set[str]:
     """Joints whose positions have the model's unit: its dynamics, its range or its drives' targets say so."""
-    found = {r.joint for r in related if r.source == "ctrl" and (r.explained or 0.0) >= effort.LIMITS.doubtful}
+    found = {r.joint for r in related if r.source == "ctrl" and (r.explained or 0.0) >= effort.SOUND}
     for j, joint in enumerate(log.joints):
         q = log.qpos[:, log.channels.columns(joint).start]
         low, high = mj_model.jnt_range[j]

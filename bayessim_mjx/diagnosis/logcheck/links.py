@@ -1,21 +1,26 @@
-"""The chain command -> effort -> motion -> measurement, each link tested alone with its measured input and output."""
+"""The chain command -> effort -> motion -> measurement, each link tested alone with its measured input and output.
+
+Command -> effort also drive by drive over all logs (`channels_of`): scale, lateness and what is left.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.logcheck.drives import efforts, measured
-from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Regressor, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.drives import LEAST, centred, commanded, controlled, efforts, measured
+from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Mask, Regressor, filtered, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import nominal
-from bayessim_mjx.diagnosis.logcheck.timing import Timing, commanded_and_measured, compare
-from bayessim_mjx.logs.log import Log
+from bayessim_mjx.diagnosis.logcheck.timing import LAGS, SURE, Timing, nearest
+from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import velocities
 from bayessim_mjx.physics import controllers
 from bayessim_mjx.quantities import percent
+
+ECHO = 10.0 * float(np.finfo(np.float32).eps)  # of the effort: no measurement comes so close to a command
 
 
 @dataclass(frozen=True)
@@ -47,7 +52,7 @@ def links(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> list[Link]:
     """All links of one log, in the order of the chain; timing: of all logs (`Gate.timing`)."""
     if log.lost:
         return []  # what a joint needs is known only with the motion of all
-    return [*_controllers(log, mj_model, timing), *_drives(log, mj_model, timing), *_sensors(log, timing)]
+    return [*_controllers(log, mj_model), *_drives(log, mj_model, timing), *_sensors(log, timing)]
 
 
 def _link(name: str, where: str, found: tuple[float, float, float], step: float, scaled: bool) -> Link:
@@ -73,19 +78,171 @@ def _untested(name: str, where: str, why: str) -> Link:
 # Command -> effort
 
 
-def _controllers(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link]:
-    name = "command -> effort"
-    pairs = {where: (asked, given, on) for where, asked, given, on in commanded_and_measured(log, mj_model)}
-    for i, actuator in enumerate(log.actuators):
-        if measured(log, i) is None:
+@dataclass(frozen=True)
+class Channel:
+    """One drive: effort = scale * command's force, `late` s after it, plus a constant.
+
+    Attributes:
+        scale, deviation; late: s; left, peak: share of the effort that this does not explain, rms and at most.
+        constant: in the unit of the effort; size: of the effort, rms.
+        noise: share of the effort that the encoders' noise may make of what a servo is thought to exert.
+        sound: it does what it is told. Of efforts in a unit of their own: as the other drives do.
+        echo: the logged effort is the command itself, no measurement.
+    """
+
+    actuator: str
+    scale: float
+    deviation: float
+    late: float
+    left: float
+    peak: float
+    constant: float
+    size: float
+    noise: float
+    echo: bool = False
+    sound: bool = False
+
+    @property
+    def static(self) -> bool:
+        """Whether nothing but a scale and a constant lies between command and effort, in any row."""
+        return max(self.left, self.peak / SURE) < LEAST and not self.echo
+
+    @property
+    def identified(self) -> bool:
+        """Whether the log tells what the drive does: noise takes its square off the scale (Fuller 1987, eq. 1.1.6)."""
+        return self.noise**2 < LEAST
+
+    @property
+    def off(self) -> float:
+        """The scale where it is surely not 1, else 1."""
+        sure = LEAST + SURE * self.deviation + self.noise**2
+        return self.scale if abs(self.scale - 1.0) > sure and self.identified and not self.echo else 1.0
+
+    @property
+    def shifted(self) -> float:
+        """The constant where it is surely not 0, else 0."""
+        sure = (LEAST + self.left) * self.size
+        return self.constant if abs(self.constant) > sure and self.identified and not self.echo else 0.0
+
+
+def channels_of(
+    logs: Sequence[Log], model: mujoco.MjModel, unit: bool, ask: Callable[[Log, mujoco.MjModel], Array] = commanded
+) -> tuple[Channel, ...]:
+    """The drives whose effort was measured in all logs.
+
+    Args:
+        unit: efforts have the unit of what is asked for; ask: what commands ask for, `[T, nu]`; default: the forces of
+            the model's actuators.
+    """
+    own = [i for i in range(model.nu) if logs and all(measured(log, i) is not None for log in logs)]
+    if not own:
+        return ()
+    pairs = [_pairs(log, model, own, ask) for log in logs]
+    period = float(np.median([log.period for log in logs]))
+    found = [_better(logs[0].actuators[i], [p[k] for p in pairs], period) for k, i in enumerate(own)]
+    common = 1.0 if unit else float(np.median([c.scale for c in found])) or 1.0
+    return tuple(_judged(c, common, period) for c in found)
+
+
+def _judged(c: Channel, common: float, period: float) -> Channel:
+    c = replace(c, scale=c.scale / common, deviation=c.deviation / abs(common))
+    obeys = c.left < LEAST + 2.0 * c.noise and abs(c.late) < period
+    return replace(c, sound=bool(obeys and c.off == 1.0 and c.shifted == 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Of one log and drive, filtered alike.
+
+    Attributes:
+        effort: `[T]`; held, centred: `[L, T]`, commanded forces at all LAGS, each with the command as it holds and as
+            it is in the middle of its row; noise: `[T]`, of the commanded force.
+        raw: `[2, T]`, commanded force and effort as logged; share: independent rows per row.
+    """
+
+    effort: Array
+    held: Array
+    centred: Array
+    noise: Array
+    raw: Array
+    share: float
+
+
+def _pairs(
+    log: Log, model: mujoco.MjModel, own: Sequence[int], ask: Callable[[Log, mujoco.MjModel], Array]
+) -> list[_Pair]:
+    moved = motion(log, model)
+    held, middle = ask(log, model), ask(centred(log), model)
+    rng = np.random.default_rng(0)
+    noisy = [x + s * rng.normal(size=x.shape) for x, s in ((log.qpos, log.sigma_qpos), (log.qvel, log.sigma_qvel))]
+    noise = ask(replace(log, qpos=noisy[0], qvel=noisy[1]), model) - held
+    out = []
+    for i in own:
+        effort = measured(log, i)
+        assert effort is not None
+        at = [filtered(x[:, i], log, moved, LAGS)[:, moved.free] for x in (held, middle)]
+        still = [filtered(x, log, moved)[moved.free] for x in (effort, noise[:, i])]
+        out.append(_Pair(still[0], at[0], at[1], still[1], np.stack([held[:, i], effort]), moved.share))
+    return out
+
+
+def _better(name: str, pairs: Sequence[_Pair], period: float) -> Channel:
+    """With commands as they hold, or in the middle of their rows: a servo's force follows the motion within a row."""
+    held = _channel(name, pairs, [p.held for p in pairs], 0.5 * period)
+    middle = _channel(name, pairs, [p.centred for p in pairs], 0.0)
+    return min(held, middle, key=lambda c: c.left)
+
+
+def _channel(name: str, pairs: Sequence[_Pair], commands: Sequence[Array], behind: float) -> Channel:
+    """Least squares of the effort on the command at the lag that explains most, and a constant.
+
+    Args:
+        behind: s that a command acts later on average than it stands in the log, which is no lateness.
+    """
+    one = np.concatenate([np.full(len(p.effort), np.sqrt(p.share)) for p in pairs])
+    rows = max(float(one @ one), 1e-9)
+    y = one * np.concatenate([p.effort for p in pairs])
+    each = one * np.concatenate(list(commands), axis=1)
+    spread = max(float(y @ y - (one @ y) ** 2 / rows), 1e-300)
+    varying = each - np.outer(each @ one / rows, one)
+    explained = (varying @ y) ** 2 / np.maximum(np.sum(varying**2, 1), 1e-300) / spread
+    lag = nearest(LAGS, explained, np.ones(len(LAGS), bool), rows).seconds
+    x = np.array([np.interp(lag, LAGS, column) for column in each.T])
+    X = np.stack([x, one], 1)
+    c, *_ = np.linalg.lstsq(X, y, rcond=None)
+    rest = y - X @ c
+    deviation = float(np.sqrt(rest @ rest / max(rows - X.shape[1], 1.0) * np.linalg.pinv(X.T @ X)[0, 0]))
+    size = max(float(np.sqrt(y @ y / rows)), 1e-300)
+    noise = float(np.sqrt(np.mean(np.concatenate([p.noise for p in pairs]) ** 2) * rows / spread)) * abs(float(c[0]))
+    left, peak = float(np.sqrt(rest @ rest / spread)), float(np.max(np.abs(rest) / one, initial=0.0)) / size
+    return Channel(name, float(c[0]), deviation, lag - behind, left, peak, float(c[1]), size, noise, _echo(pairs))
+
+
+def _echo(pairs: Sequence[_Pair]) -> bool:
+    """Whether every effort is its own row's command up to a scale, or that of the row before."""
+    for late in (0, 1):
+        x = np.concatenate([p.raw[0, : p.raw.shape[1] - late] for p in pairs])
+        y = np.concatenate([p.raw[1, late:] for p in pairs])
+        scale = float(x @ y) / max(float(x @ x), 1e-300)
+        if np.abs(y - scale * x).max() < ECHO * (float(np.sqrt(np.mean(y**2))) + 1e-300):
+            return True
+    return False
+
+
+def _controllers(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
+    """Efforts have the unit of ctrl where a law is declared, else that of the model's force."""
+    name, declared = "command -> effort", controllers.declared(log.metadata)
+    found = {c.actuator: c for c in channels_of([log], mj_model, True, controlled if declared else commanded)}
+    for actuator in log.actuators:
+        c = found.get(actuator)
+        if c is None:
             yield _untested(name, actuator, "no complete effort stream was logged")
-        elif actuator not in pairs:
+        elif not np.isfinite(c.noise) or c.left >= 1.0:
             yield _untested(name, actuator, "command or effort never changes while the drive is on")
         else:
-            lag = timing.efforts[actuator].sure
-            asked, given, on = pairs[actuator]
-            link = (*compare(asked, given, log.period, on, lag), lag)
-            yield _link(name, actuator, link, log.period, controllers.declared(log.metadata))
+            late = c.late + 0.5 * log.period  # as the stamps say it
+            late = late if abs(late) > log.period else 0.0
+            yield _link(name, actuator, (c.scale, (1.0 - c.left**2) ** 0.5, late), log.period, declared)
 
 
 # Effort -> motion
@@ -107,8 +264,17 @@ def _drives(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link
             yield _untested(name, effort.joint, "too little motion free of contacts and limits")
             continue
         lag = timing.motion[effort.joint].sure if effort.joint in timing.motion else 0.0
-        link = (*compare(signal, needed[:, effort.dof], moved.step, rows, lag), lag)
+        link = (*_compare(signal, needed[:, effort.dof], moved.step, rows, lag), lag)
         yield _link(name, effort.joint, link, log.period, effort.scaled)
+
+
+def _compare(predicted: Array, measured: Array, step: float, rows: Mask, lag: float) -> tuple[float, float]:
+    """Slope and correlation of measured [T] and predicted [T] `lag` s before, both every `step` s, over rows [T]."""
+    time = step * np.arange(len(predicted))
+    x, y = np.interp(time - lag, time, predicted)[rows], measured[rows] - measured[rows].mean()
+    x = x - x.mean()
+    norm = float(np.linalg.norm(x) * np.linalg.norm(y))
+    return float(x @ y) / max(float(x @ x), 1e-300), float(x @ y) / norm if norm > 0 else 0.0
 
 
 # Motion -> measurement

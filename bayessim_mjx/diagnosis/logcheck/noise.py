@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from bayessim_mjx.diagnosis.logcheck.single_log import LIMITS
+from bayessim_mjx.diagnosis.logcheck.single_log import FEWEST
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.signals import LEVELS, noise_level, values_shown
 
 Array = NDArray[np.float64]
-# s, times a joint's speed: the least noise of a position. Only logs of a simulation show less. Rule of thumb.
-PRECISE = 5e-7
+# s, times a joint's speed: the least noise of a position, that of a simulation whose numbers are float32.
+PRECISE = 4.0 * float(np.finfo(np.float32).eps)
 ONCE = "no run was repeated: these logs do not separate chance from an error of the model"
 
 
@@ -90,10 +90,10 @@ def noise_free(logs: Sequence[Log], column: int) -> bool:
 
 def _smooth(x: Array) -> float | None:
     """Level of the eighth differences of x [T] in that of the fourth ones, where x moves; None: it hardly does."""
-    if len(x) <= LIMITS.min_rows + 8:
+    if len(x) <= FEWEST + 8:
         return None
     changing = np.asarray(np.lib.stride_tricks.sliding_window_view(np.diff(x) != 0, 8).any(1))
-    if changing.sum() < LIMITS.min_rows:
+    if changing.sum() < FEWEST:
         return None
     return _level(x, 8, changing) / max(_level(x, 4, changing), 1e-300)
 

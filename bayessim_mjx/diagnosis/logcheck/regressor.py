@@ -15,15 +15,15 @@ from scipy.ndimage import binary_dilation
 from scipy.optimize import lsq_linear
 
 from bayessim_mjx.diagnosis.logcheck import rigid_body
+from bayessim_mjx.diagnosis.logcheck.drives import LEAST
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import bandwidth, lowpass
 
 Mask = NDArray[np.bool_]
-SLOW = 0.02  # of a joint's top speed, at which dry friction turns over; rule of thumb, not measured
-TILT = 0.3  # rad, by which a base may be tilted at most; rule of thumb, not measured
-# Independent rows, below which no effort is compared with a motion. Source: as many columns of the effort's model have
-# no upper bound (`effort`), so fewer rows would be explained whatever they hold.
-FEWEST = 6.0
+# Columns of a joint's own motion that the model of an effort has, without an upper bound.
+LOOSE = ("one", "speed", "dry", "drag", "acceleration", "position")
+# Independent rows, below which no effort is compared with a motion: fewer would be explained whatever they hold.
+FEWEST = float(len(LOOSE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,25 +143,24 @@ class Regressor:
         sets: see `rigid_body.rigid`.
         """
         v = moved.qvel
-        slow = SLOW * np.percentile(np.abs(v), 95, axis=0) + 1e-12 if slow is None else slow
+        slow = LEAST * np.percentile(np.abs(v), 95, axis=0) + 1e-12 if slow is None else slow
         dry = np.tanh(v / slow)
         rigid = rigid_body.rigid(model, moved.qpos, v, moved.qacc, sets)
-        spring = rigid_body.springs(model, moved.qpos)
-        known = rigid.nominal + spring + model.dof_damping * v + model.dof_armature * moved.qacc
+        known = rigid.nominal + rigid.spring + model.dof_damping * v + model.dof_armature * moved.qacc
         known += model.dof_frictionloss * dry
         position = np.zeros_like(v) + np.cumsum(v, 0) * moved.step
         for joint in np.flatnonzero(model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)):
             position[:, int(model.jnt_dofadr[joint])] = moved.qpos[:, int(model.jnt_qposadr[joint])]
         own = {
             "acceleration": moved.qacc, "speed": v, "dry": dry, "drag": v * np.abs(v), "position": position,
-            "one": np.ones_like(v), "load": np.abs(rigid.bias + spring) * dry,
+            "one": np.ones_like(v), "load": np.abs(rigid.bias + rigid.spring) * dry,
         }  # fmt: skip
         return cls(
             moved,
             columns=moved.smooth(rigid.columns),
             known=moved.smooth(known),
             weight=moved.smooth(rigid.weight),
-            spring=moved.smooth(spring),
+            spring=moved.smooth(rigid.spring),
             tilt=moved.smooth(rigid.tilt),
             own={name: moved.smooth(x) for name, x in own.items()},
             dry=dry,
@@ -176,10 +175,6 @@ class Bounded:
     low: Array
     high: Array
     rigid: slice  # the model's own bodies and springs, which have a scale
-
-    def friction(self) -> Bounded:
-        """Offset and friction alone, as if the joint carried nothing."""
-        return Bounded(self.x[:, :4], self.low[:4], self.high[:4], slice(0, 0))
 
     def explained(self, efforts: Array, rows: Mask, scaled: bool = True) -> Array:
         """[L] share of the variance of efforts [L, T] over the rows [T] that the bounded model explains, or below zero.

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-INERTIAL = 10  # parameters of a body: mass, first moments (3) and inertia (6), as Atkeson et al. count them
-BLOCK = 2000  # rows at a time: the memory that they take; results differ by rounding alone
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+INERTIAL = 1 + 3 + len(_PAIRS)  # parameters of a body: mass, first moments and inertia
 
 
 def moving_bodies(model: mujoco.MjModel) -> list[int]:
@@ -23,15 +22,22 @@ def moving_bodies(model: mujoco.MjModel) -> list[int]:
     return [b for b in range(1, model.nbody) if model.body_weldid[b] == b]
 
 
+def gravity(model: mujoco.MjModel) -> Array:
+    """m/s^2, `[3]`; nothing where the model has it disabled."""
+    off = int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    return np.zeros(3) if off else np.array(model.opt.gravity)
+
+
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Where the moving bodies are, and how they move, along a motion.
+    """Where the moving bodies are, and how they move, along a motion; and what the model does without its drives.
 
     Attributes:
         bodies: `[B]`; linear, angular: `[T, B, 3, nv]`, Jacobians of their frames' origins, in the bodies' own axes.
         spin, turning, felt: `[T, B, 3]`, angular velocity and acceleration, and acceleration less gravity of the
-            origin, in the bodies' own axes; down: `[T, B, 3]`, gravity likewise.
+            origin, in the bodies' own axes.
         rotation: `[T, B, 3, 3]`, body to world; bias: `[T, nv]`, M 0 + c of the nominal model (no acceleration).
+        spring, held: `[T, nv]`, generalised forces of the model's springs and of its compensation of gravity.
     """
 
     bodies: tuple[int, ...]
@@ -40,9 +46,10 @@ class Frames:
     spin: Array
     turning: Array
     felt: Array
-    down: Array
     rotation: Array
     bias: Array
+    spring: Array
+    held: Array
 
     @classmethod
     def of(cls, model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> Frames:
@@ -50,41 +57,34 @@ class Frames:
         bodies, data = moving_bodies(model), mujoco.MjData(model)
         rows, count, nv = len(qpos), len(bodies), model.nv
         jp, jr, dp, dr = (np.zeros((rows, count, 3, nv)) for _ in range(4))
-        rotation, bias = np.zeros((rows, count, 3, 3)), np.zeros((rows, nv))
+        rotation, (bias, spring, held) = np.zeros((rows, count, 3, 3)), np.zeros((3, rows, nv))
         for k in range(rows):
             data.qpos[:], data.qvel[:] = qpos[k], qvel[k]
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            mujoco.mj_comVel(model, data)
-            mujoco.mj_rne(model, data, 0, bias[k])
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            bias[k], spring[k], held[k] = data.qfrc_bias, data.qfrc_spring, data.qfrc_gravcomp
             for i, body in enumerate(bodies):
                 point = data.xpos[body]
                 mujoco.mj_jac(model, data, jp[k, i], jr[k, i], point, body)
                 mujoco.mj_jacDot(model, data, dp[k, i], dr[k, i], point, body)
                 rotation[k, i] = data.xmat[body].reshape(3, 3)
-        gravity = np.where(int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY), 0, model.opt.gravity)
         origin = _times(jp, qacc) + _times(dp, qvel)
         turned = _times(jr, qacc) + _times(dr, qvel)
         own = np.swapaxes(rotation, -1, -2)  # world to body
         put = lambda x: np.einsum("tbij,tbj->tbi", own, x)  # noqa: E731
-        down = put(np.broadcast_to(gravity, origin.shape))
+        felt = put(origin - gravity(model))
         return cls(
-            tuple(bodies), own @ jp, own @ jr, put(_times(jr, qvel)), put(turned), put(origin) - down, down,
-            rotation, bias,
-        )  # fmt: skip
+            tuple(bodies), own @ jp, own @ jr, put(_times(jr, qvel)), put(turned), felt, rotation, bias, spring, held
+        )
 
     def columns(self) -> Array:
         """`[T, B, nv, 10]`, the generalised force that a unit of each inertial parameter asks for."""
         return self._columns(self.felt, self.turning, self.spin)
 
-    def tilted(self, direction: Array) -> Array:
-        """`[T, B, nv, 10]` of gravity alone, pointing along a direction `[3]` of the world with its length."""
+    def weight(self, direction: Array) -> Array:
+        """`[T, B, nv, 10]` of gravity alone, along a direction `[3]` of the world with its length."""
         own = np.einsum("tbji,j->tbi", self.rotation, direction)
         return self._columns(-own, np.zeros_like(own), np.zeros_like(own))
-
-    def weight(self) -> Array:
-        """`[T, B, nv, 10]` of gravity alone, as it is."""
-        return self._columns(-self.down, np.zeros_like(self.down), np.zeros_like(self.down))
 
     def _columns(self, felt: Array, turning: Array, spin: Array) -> Array:
         skew = _skew(turning) + _skew(spin) @ _skew(spin)
@@ -144,12 +144,13 @@ def nominal(model: mujoco.MjModel) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Rigid:
-    """Generalised forces that rigid bodies need for a motion.
+    """Generalised forces that rigid bodies need for a motion, beside what compensates their weight (`gravcomp`).
 
     Attributes:
         columns: `[T, nv, K]`, per unit of each (set of) inertial parameters.
         nominal: `[T, nv]`, of the model's own; weight: the part of it that is gravity; bias: without acceleration.
         tilt: `[T, nv, 2]`, per rad by which the world is turned about its x and y axis.
+        spring: `[T, nv]`, that the model's own springs need.
     """
 
     columns: Array
@@ -157,6 +158,7 @@ class Rigid:
     weight: Array
     bias: Array
     tilt: Array
+    spring: Array
 
 
 def rigid(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array, sets: Array | None = None) -> Rigid:
@@ -166,16 +168,17 @@ def rigid(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array, sets: Ar
         sets: `[K, B, 10]`, inertial parameters of which each column is made; None: one column each, of body after body.
     """
     own, parts = nominal(model), []
-    falls = [-np.cross(axis, model.opt.gravity) for axis in np.eye(3)[:2]]
-    for a in range(0, len(qpos), BLOCK):  # Jacobians of all rows of a long log would not fit into memory
-        rows = slice(a, a + BLOCK)
+    acts = 1.0 - model.body_gravcomp[moving_bodies(model), None, None]  # share of gravity that the drives feel
+    falls = [-np.cross(axis, gravity(model)) for axis in np.eye(3)[:2]]
+    for rows in np.array_split(np.arange(len(qpos)), max(1, min(model.nv, len(qpos)))):  # all would fill the memory
         frames = Frames.of(model, qpos[rows], qvel[rows], qacc[rows])
-        each = frames.columns()
+        whole, down = frames.columns(), frames.weight(gravity(model))
+        each = whole - (1.0 - acts) * down
         columns = np.moveaxis(each, 1, 2) if sets is None else np.einsum("tbvk,cbk->tvc", each, sets)
-        needed = np.einsum("tbvk,bk->tv", each, own)
-        down, *tilt = (np.einsum("tbvk,bk->tv", x, own) for x in (frames.weight(), *map(frames.tilted, falls)))
-        shape = (*needed.shape, -1)
-        parts.append((columns.reshape(shape), needed, down, frames.bias, np.stack(tilt, -1)))
+        needed, weight = (np.einsum("tbvk,bk->tv", x, own) - frames.held for x in (whole, down))
+        tilt = np.stack([np.einsum("tbvk,bk->tv", acts * frames.weight(x), own) for x in falls], -1)
+        columns = columns.reshape(*needed.shape, -1)
+        parts.append((columns, needed, weight, frames.bias - frames.held, tilt, -frames.spring))
     return Rigid(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
 
@@ -188,15 +191,7 @@ def recursive(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> A
         mujoco.mj_comPos(model, data)
         mujoco.mj_comVel(model, data)
         mujoco.mj_rne(model, data, 1, row)
-    return out
-
-
-def springs(model: mujoco.MjModel, qpos: Array) -> Array:
-    """`[T, nv]`, effort that holds the model's own springs at positions `[T, nq]`."""
-    data, out = mujoco.MjData(model), np.zeros((len(qpos), model.nv))
-    for k, q in enumerate(qpos):
-        data.qpos[:] = q
-        mujoco.mj_fwdPosition(model, data)
-        mujoco.mj_fwdVelocity(model, data)
-        out[k] = -data.qfrc_spring
+        if model.ngravcomp:
+            mujoco.mj_passive(model, data)
+            row -= data.qfrc_gravcomp
     return out

@@ -11,26 +11,11 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.signals import quantum
+from bayessim_mjx.logs.velocities import bandwidth
 from bayessim_mjx.quantities import percent
 
-
-@dataclass(frozen=True)
-class Limits:
-    """What one log has to have, and which values are no measurements. Rules of thumb.
-
-    How often flat tops, jitter and units are named falsely, and missed: benchmarks/records/log_checks.json.
-    """
-
-    # fewer rows or control steps than this hold no window
-    min_rows: int = 20
-    min_steps: int = 10
-    clipped: float = 0.05  # share of the rows on one flat top
-    moment: float = 0.05  # s, over which a speed is taken
-    # values that a register of 16 or of 32 bits holds
-    registers: tuple[float, float] = (2.0**16, 2.0**32)
-
-
-LIMITS = Limits()
+FEWEST = 20  # rows and control steps: fewer hold no window; a rule of thumb, not counted
+REGISTERS = 2.0**16, 2.0**32  # values that a register of 16 or of 32 bits holds
 _FASTEST = {"hinge": 150.0, "slide": 50.0}  # rad/s, m/s; faster: probably another unit (a rule of thumb)
 
 
@@ -44,13 +29,10 @@ class Finding:
 
 def size(log: Log, dt: float) -> Iterator[Finding]:
     """Rows, duration and rate against the control period dt [s]."""
-    if len(log) < LIMITS.min_rows or log.duration < LIMITS.min_steps * dt:
+    if min(len(log), log.duration / dt) < FEWEST:
         have = f"{len(log)} rows over {log.duration:.3g} s"
-        yield Finding(
-            "refused",
-            f"too short: {have}; allowed: at least {LIMITS.min_rows} rows and {LIMITS.min_steps} control steps "
-            f"of {dt:.3g} s",
-        )
+        need = f"at least {FEWEST} rows and as many control steps of {dt:.3g} s"
+        yield Finding("refused", f"too short: {have}; allowed: {need}")
     elif log.period > 20 * dt:
         yield Finding("refused", f"one row per {log.period:.3g} s; allowed: up to 20 control periods of {dt:.3g} s")
     elif log.period > 1.5 * dt:
@@ -107,7 +89,7 @@ def clipped(log: Log, targets: Mapping[str, Array]) -> Iterator[Finding]:
         for end in (float(x.max()), float(x.min())):
             flat = _flat(x, end)
             share = float(np.mean(flat))
-            if share > LIMITS.clipped and not (target is not None and _steady(target[flat], quantum(x))):
+            if share > 0 and not (target is not None and _steady(target[flat], quantum(x))):
                 text = f"{name} is clipped at {end:.5g} ({percent(share)} of the rows"
                 drive = name.startswith("effort:")
                 end_of = "the drive's limit" if drive else "a hard stop"
@@ -147,7 +129,7 @@ def wrapped(log: Log, dt: float) -> Iterator[Finding]:
         x = x[np.isfinite(x)]
         jump = float(np.abs(np.diff(x)).max(initial=0.0))
         for grain in {1.0, quantum(x)} - {0.0}:
-            for register in LIMITS.registers:
+            for register in REGISTERS:
                 if abs(jump / grain - register) < 0.05 * register:
                     bits = int(np.log2(register))
                     text = f"{name} jumps by {jump:.6g}: a signed {bits}-bit register read as unsigned"
@@ -181,8 +163,8 @@ def units(log: Log, known: Collection[str] = ()) -> Iterator[Finding]:
 
 
 def _speed(log: Log, column: int) -> Array:
-    """Speeds over MOMENT s: between two rows noise and jitter of the stamps are fast as well."""
-    each = max(1, round(LIMITS.moment / log.period))
+    """Speeds over half a cycle of the bandwidth: between two rows noise and jitter of the stamps are fast as well."""
+    each = max(1, round(0.5 / (bandwidth(log) * log.period)))
     return np.asarray(
         np.abs((log.qpos[each:, column] - log.qpos[:-each, column]) / (log.time[each:] - log.time[:-each]))
     )

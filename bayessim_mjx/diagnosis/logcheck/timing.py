@@ -1,35 +1,29 @@
-"""The clock of the logs: what is late, behind what, by how much and how surely.
+"""The clock of the logs: what is late behind what, by how much and how surely.
 
 Each lateness has one estimator, since each is another quantity:
 
 - velocities behind the derivatives of their positions: `logs.velocities`, lags over all measured rows;
 - motion behind the effort: `effort`, where the bounded inverse dynamics of a log explain most;
-- measured efforts behind the stamps of their commands: `offset`, where the two columns correlate most;
+- measured efforts behind their commands: `links`, where the command explains most of the effort;
 - commands behind (or before) their rows: `fitting.command_shift`, by simulation, beside all that forces can explain;
 - jitter of the stamps themselves: `logs.stamps`;
-- what no estimator is sure of, up to a part of a row: nuisance numbers of every fit, `evidence.doubts`.
+- what no estimator is sure of, up to a part of a row: nuisance numbers of every fit, `evidence.doubts`, and in the
+  inverse dynamics the term "lateness" of `equation_error.terms`.
 
-Three more are no clocks. `drive_channel.Channel.late` is the mean time by which a drive answers a held command: of its
-own lag as well, and from where the command acts, half a row behind its stamp. The term "lateness" of
-`equation_error.terms` lets all efforts be late by a common time while effects are compared; its value is not used.
-`residual.frequency.delay` is the delay that the recalibrated model lacks.
+`residual.frequency.delay` is no clock but the delay that the recalibrated model lacks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.logcheck.drives import commanded, controlled, measured
-from bayessim_mjx.diagnosis.logcheck.single_log import LIMITS
-from bayessim_mjx.logs.log import Array, Log
-from bayessim_mjx.physics import controllers
+from bayessim_mjx.logs.log import Array
 
-LAGS = np.linspace(-0.2, 0.2, 161)  # s, odd: none is among them
+LAGS = np.linspace(-0.5, 0.5, 201)  # s, odd: none is among them
 # Standard errors from which on a lateness is believed. Rule of thumb: the errors are those of white residuals, and of
 # logs with nothing hidden 90 % of the latenesses lie within four of them (benchmarks/records/log_checks.json).
 SURE = 4.0
@@ -47,6 +41,10 @@ class Late:
         """s; 0 where it lies within SURE standard errors of 0."""
         return 0.0 if abs(self.seconds) < SURE * self.error else self.seconds
 
+    def beyond(self, row: float) -> float:
+        """s; 0 where it may be within a row [s] of a held command, which acts half a row after its stamp on average."""
+        return self.seconds if abs(self.seconds - row / 2) - row > SURE * self.error else 0.0
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -55,13 +53,11 @@ class Timing:
     Attributes:
         velocities: {velocity channel: behind the derivative of its position}.
         motion: {joint: behind its effort, the measured one where there is one}; held commands alone make half a row.
-        efforts: {actuator: measured effort behind the command}; empty where none was measured.
         moved: s by which the logs' commands were moved since.
     """
 
     velocities: Mapping[str, Late] = field(default_factory=dict)
     motion: Mapping[str, Late] = field(default_factory=dict)
-    efforts: Mapping[str, Late] = field(default_factory=dict)
     moved: float = 0.0
 
 
@@ -78,43 +74,23 @@ def pooled(each: Iterable[tuple[str, Late]]) -> dict[str, Late]:
     return out
 
 
-def compare(predicted: Array, measured: Array, step: float, rows: NDArray[np.bool_], lag: float) -> tuple[float, float]:
-    """Slope and correlation of measured [T] and predicted [T] `lag` s before, both every `step` s, over rows [T]."""
-    time = step * np.arange(len(predicted))
-    x, y = np.interp(time - lag, time, predicted)[rows], measured[rows] - measured[rows].mean()
-    x = x - x.mean()
-    norm = float(np.linalg.norm(x) * np.linalg.norm(y))
-    return float(x @ y) / max(float(x @ x), 1e-300), float(x @ y) / norm if norm > 0 else 0.0
+def nearest(lags: Array, explained: Array, allowed: NDArray[np.bool_], count: float) -> Late:
+    """The smallest lag that is about as good as the best of those allowed.
 
-
-def offset(predicted: Array, measured: Array, step: float, rows: NDArray[np.bool_]) -> float:
-    """s between the stamps of two columns: where they correlate most, if half of what is unexplained goes; else 0.
-
-    `drive_channel` states when a drive acts on average while a command holds, which is another time by half a row.
+    Args:
+        lags: `[L]` s, even; explained: `[L]`, share of the variance; allowed: `[L]`.
+        count: independent rows n. Of residuals with the variance s(lag) the likelihood is s^(-n/2), whose curvature at
+            the vertex of a parabola s = s0 + c (lag - lag0)^2 gives the error sqrt(s0 / (n c)).
     """
-    scores = [compare(predicted, measured, step, rows, lag)[1] for lag in LAGS]
-    best, now = int(np.argmax(scores)), len(LAGS) // 2
-    clear = 1.0 - scores[best] <= 0.5 * (1.0 - scores[now]) and best not in (0, len(LAGS) - 1)
-    return float(LAGS[best]) if clear else 0.0
-
-
-def offsets(log: Log, mj_model: mujoco.MjModel) -> Iterator[tuple[str, Late]]:
-    """(actuator, measured effort behind its command), of one log."""
-    for actuator, asked, given, rows in commanded_and_measured(log, mj_model):
-        yield actuator, Late(offset(asked, given, log.period, rows))
-
-
-def commanded_and_measured(log: Log, mj_model: mujoco.MjModel) -> Iterator[tuple[str, Array, Array, NDArray[np.bool_]]]:
-    """(actuator, effort that its command asks for, measured effort, rows), on an even grid, where both change.
-
-    What is asked for is ctrl where a law is declared, whose unit efforts then have; else the model's own force.
-    """
-    streams = {i: stream for i in range(mj_model.nu) if (stream := measured(log, i)) is not None}
-    if not streams:
-        return
-    grid = np.linspace(log.time[0], log.time[-1], len(log))
-    target = controlled(log, mj_model) if controllers.declared(log.metadata) else commanded(log, mj_model)
-    for i, stream in streams.items():
-        if log.enabled.sum() >= LIMITS.min_rows and np.ptp(target[:, i]) > 0 and np.ptp(stream) > 0:
-            asked, given = (np.interp(grid, log.time, x) for x in (target[:, i], stream))
-            yield log.actuators[i], asked, given, log.enabled
+    best, now = float(explained[allowed].max()), float(np.interp(0.0, lags, explained))
+    good = np.flatnonzero(allowed & (explained >= best - min(0.002, 0.1 * (best - now))))
+    k = int(good[np.argmin(np.abs(lags[good]))])
+    first, last = np.flatnonzero(allowed)[[0, -1]]
+    while first < k < last and max(explained[k - 1], explained[k + 1]) > explained[k]:
+        k += 1 if explained[k + 1] > explained[k - 1] else -1  # to the top of its hill
+    if k in (0, len(lags) - 1) or max(explained[k - 1], explained[k + 1]) > explained[k]:
+        return Late(float(lags[k]))  # no top lies among the lags
+    left, top, right = explained[k - 1 : k + 2]  # the vertex of the parabola through them
+    bend, step = max(2 * top - left - right, 1e-12), float(lags[1] - lags[0])
+    error = step * float(np.sqrt(max(1.0 - top, 0.0) / (0.5 * bend * max(count, 1.0))))
+    return Late(float(lags[k] + 0.5 * step * (right - left) / bend), error)

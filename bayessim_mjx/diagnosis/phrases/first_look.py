@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.equation_error.search import Proposal
-from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel
+from bayessim_mjx.diagnosis.logcheck.links import Channel
 from bayessim_mjx.diagnosis.phrases.effects import MOST, any_of, measured, titled
 from bayessim_mjx.quantities import listed, percent
 
@@ -34,8 +34,8 @@ def lines(look: Look) -> list[str]:
         for label, why in look.vetoes.items()
         if label.startswith("actuator_gain@")
     ]
-    if look.identifiability and look.identifiability.unknown:
-        names = listed(look.identifiability.unknown, most=MOST)
+    if look.unknown:
+        names = listed(look.unknown, most=MOST)
         out.append(f"these logs determine the mass of {names} no better than the data sheet does")
     return out
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.logcheck.drive_channel import Channel, channels_of
+from bayessim_mjx.diagnosis.logcheck.links import Channel, channels_of
 from bayessim_mjx.logs import Log
 from tests.diagnosis.recordings import ARM, record, sines
 

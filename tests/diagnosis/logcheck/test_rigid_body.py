@@ -39,22 +39,33 @@ def test_columns_times_parameters_are_the_inverse_dynamics(moved):
         assert found.nominal[k] == pytest.approx(data.qfrc_inverse - model.dof_armature * qacc, abs=1e-9)
 
 
-def test_sets_of_parameters_are_columns_of_their_own_and_long_motions_are_made_in_blocks(moved, monkeypatch):
+def test_sets_of_parameters_are_columns_of_their_own_and_long_motions_are_made_in_blocks(moved):
     model, motion = moved
     own = rigid_body.nominal(model)
     sets = np.eye(len(own))[:, :, None] * own
     whole = rigid_body.rigid(model, *motion, sets)
     assert whole.columns.sum(-1) == pytest.approx(whole.nominal, abs=1e-9)
-    monkeypatch.setattr(rigid_body, "BLOCK", 7)
-    for name, x in vars(rigid_body.rigid(model, *motion, sets)).items():
-        assert x == pytest.approx(getattr(whole, name), abs=1e-12)
+    first = rigid_body.rigid(model, *(x[:1] for x in motion), sets)
+    for name, x in vars(first).items():
+        assert x == pytest.approx(getattr(whole, name)[:1], abs=1e-12)
 
 
 def test_gravity_alone_is_what_rest_asks_for(moved):
     model, motion = moved
     frames = rigid_body.Frames.of(model, motion[0], *np.zeros_like(motion[1:]))
-    assert frames.weight() == pytest.approx(frames.columns(), abs=1e-12)
-    assert frames.tilted(model.opt.gravity) == pytest.approx(frames.columns(), abs=1e-12)
+    assert frames.weight(model.opt.gravity) == pytest.approx(frames.columns(), abs=1e-12)
+
+
+def test_what_the_model_compensates_needs_no_drive(moved):
+    model, motion = mujoco.MjModel.from_xml_string(TREE.replace("<body ", '<body gravcomp=".7" ')), moved[1]
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    found, data = rigid_body.rigid(model, *motion), mujoco.MjData(model)
+    assert found.nominal == pytest.approx(found.columns @ rigid_body.nominal(model).ravel(), abs=1e-9)
+    assert found.nominal == pytest.approx(rigid_body.recursive(model, *motion), abs=1e-9)
+    for k, (qpos, qvel, qacc) in enumerate(zip(*motion, strict=True)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = qpos, qvel, qacc
+        mujoco.mj_inverse(model, data)
+        assert found.nominal[k] == pytest.approx(data.qfrc_inverse - model.dof_armature * qacc, abs=1e-9)
 
 
 def test_a_point_mass_is_its_own_parameters():

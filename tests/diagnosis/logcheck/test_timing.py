@@ -35,3 +35,10 @@ def test_a_lateness_within_four_errors_is_none() -> None:
     each = [("hinge", Late(x, 0.002)) for x in (0.01, 0.03, 0.011, 0.012)]
     assert pooled(each) == {"hinge": Late(pytest.approx(0.0115), pytest.approx(0.001))}
     assert pooled([*each, ("hinge", Late(0.0115))]) == pooled(each)  # an unknown error says nothing
+
+
+def test_motion_is_late_where_it_is_surely_another_rows() -> None:
+    row = 0.01
+    assert Late(0.005, 1e-4).beyond(row) == Late(-0.004, 1e-4).beyond(row) == Late(0.014, 1e-4).beyond(row) == 0.0
+    assert Late(0.016, 1e-4).beyond(row) == 0.016 and Late(-0.006, 1e-4).beyond(row) == -0.006
+    assert Late(0.016, 1e-3).beyond(row) == 0.0 and Late(0.3).beyond(row) == 0.0  # of unknown error
