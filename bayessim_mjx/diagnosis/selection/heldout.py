@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
@@ -16,12 +17,9 @@ from bayessim_mjx.diagnosis.fitting.quadratic import RULES as HELD_OUT
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
 from bayessim_mjx.diagnosis.gap import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, RELEVANCE
 
 Array = NDArray[np.float64]
-
-
-GRID = 1000  # shares at which an interval is looked for, dense near 1: 16 decades of float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +97,7 @@ class _Fold:
         self.fitter, self.fit = fitter, replace(fit, weight=fit.weight * kept)
         cost = fitter.cost(self.fit, fit.r, fit.offsets, fit.values)
         nat = 2 * cost / (model.samples * kept.mean())
-        self.limit, self.worth = cost + nat * math.log(ODDS.strong), nat * EFFORT.tolerance
+        self.limit, self.worth = cost + nat * math.log(ODDS.strong), nat * RELEVANCE.share
         self.found = fit.values
         self.values, self.offsets = self._step(fit.values, fit.offsets, fit.r)
 
@@ -227,25 +225,27 @@ class Closed:
         logarithm, and near 0 alike. As many conditions count as rule the one or the other, whichever are fewer. What
         undercuts the noise shows by how much the noise was taken for too large: that error of the floor counts too.
         """
-        rows = statistics.leave_one_out(self.group)
-        every, value = np.ones((1, len(self.before))), self.value
+        rows, value = statistics.leave_one_out(self.group), self.value
         if len(rows) < 2 or math.isnan(value):
             return statistics.NOTHING
-        _, _, noise = (float(x[0]) for x in self._sums(every))
-        far_off = np.geomspace(2.0, np.finfo(np.float64).eps, GRID)
-        near = (1.0 - value) * (1.0 + np.concatenate([-far_off, far_off]) / 2)  # where errors are small
-        shares = np.clip(1.0 - np.sort(np.concatenate([far_off, near, [0.0]]))[::-1], -1.0, 1.0)[:, None]
+        (before, left, noise), without = self._sums(np.ones(len(self.before))), self._sums(rows)
         off = max(1.0 - float(self.after.sum()) / noise, 0.0)  # of the floor
+        left, left_without = (np.maximum(x, 1e-9) for x in (left, without[1]))
 
-        def both(rows: Array) -> tuple[Array, Array]:
-            before, left, noise = self._sums(rows)
-            return np.maximum(left, 1e-9), np.maximum((1 - shares) * before + shares * noise, 1e-9)
+        def beyond(share: float) -> float:
+            """How much farther off 0 the logarithm is than is allowed."""
+            said, said_without = (
+                np.maximum((1 - share) * b + share * n, 1e-9) for b, n in ((before, noise), without[::2])
+            )
+            counting = (np.maximum(x - y, 0.0) for x, y in ((left, left_without), (said, said_without)))
+            freedom = min(float(statistics.freedom(own, statistics.RULED)) for own in counting)
+            error = float(statistics.error(np.log(left_without / said_without)))
+            allowed = float(statistics.quantile(freedom)) * math.hypot(error, off * share * noise / said)
+            return abs(math.log(left / said)) - allowed
 
-        (left, said), (left_without, said_without) = both(every), both(rows)
-        counting = [np.maximum(left - left_without, 0.0)[:, None], np.maximum(said - said_without, 0.0).T]
-        freedom = np.minimum(*(statistics.freedom(own, statistics.RULED) for own in counting))
-        error = statistics.error(np.log(left_without / said_without).T)
-        allowed = statistics.quantile(freedom) * np.hypot(error, off * shares[:, 0] * noise / said[:, 0])
-        far = np.log(left / said)
-        kept = shares[:, 0][np.abs(far[:, 0]) <= allowed]
-        return float(min([*kept[:1], value])), float(max([*kept[-1:], value]))
+        def end(farthest: float) -> float:
+            if beyond(value) > 0.0 or beyond(farthest) <= 0.0:
+                return value if beyond(value) > 0.0 else farthest
+            return float(brentq(beyond, value, farthest, xtol=np.finfo(np.float64).eps))
+
+        return end(-1.0) if value > -1.0 else value, end(1.0)

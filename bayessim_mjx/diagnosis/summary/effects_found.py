@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.diagnosis import statistics
-from bayessim_mjx.diagnosis.evidence.selecting import Rival
-from bayessim_mjx.diagnosis.evidence.weighing import Size, size_of
+from bayessim_mjx.diagnosis.evidence.selecting import Rival, Size, size_of
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.phrases import effects as phrases

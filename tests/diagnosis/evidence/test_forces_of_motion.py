@@ -17,24 +17,26 @@ def test_terms_of_a_driven_pendulum_by_hand():
     """Inertia times acceleration; damping and the servo's, through its gear squared; gravity and spring."""
     model = mujoco.MjModel.from_xml_string(SERVO)
     data, q, v, a = mujoco.MjData(model), 0.4, -1.3, 7.0
-    inertial, by_speed, by_position = doubts._at(model, data, np.array([q]), np.array([v]), np.array([a]))[:, 0]
+    found = doubts._at(model, data, np.array([q]), np.array([v]), np.array([a]))[:, 0]
+    inertial, by_speed, by_position = found[:3]
     about_joint = model.body_inertia[1][1] + 1.5 * 0.25**2 + 0.05
     assert inertial == pytest.approx(about_joint * a)
     assert by_speed == pytest.approx((0.3 + 4 * 2**2) * v)
     assert by_position == pytest.approx(1.5 * 9.81 * 0.25 * np.sin(q) + 2 * q)
+    assert found[3:] == pytest.approx([v, q])
 
 
 def test_a_number_that_takes_a_common_force_is_as_uncertain_as_that_force(monkeypatch):
     """A mass whose column is the inertial force: of 2 N m rms and a missing force of .01 N m it is known to .5 %."""
     rng = np.random.default_rng(0)
-    forces, D = np.zeros((5, 3, 1, 4)), rng.normal(size=(5, 30, 4))
+    forces, states, D = np.zeros((5, 3, 1, 4)), rng.normal(size=(5, 2, 1, 4)), rng.normal(size=(5, 30, 4))
     forces[:, 0, 0] = rng.normal(size=(5, 4))
     forces *= 2.0 / np.sqrt(np.mean(forces[:, 0] ** 2))
-    monkeypatch.setattr(doubts, "of_motion", lambda fitter, nodes: forces)
+    monkeypatch.setattr(doubts, "of_motion", lambda fitter, nodes: (forces, states))
     column = (D @ forces[:, 0, 0, :, None])[..., 0]
-
-    def step(r):
-        return np.array([np.sum(column * r) / np.sum(column**2)])
-
-    found = doubts.covariance(SimpleNamespace(), D, np.array([0.01]), step, rng.normal(size=column.shape))
-    assert np.sqrt(found) == pytest.approx(0.005)
+    found = doubts.common(SimpleNamespace(), D, np.array([0.01]))
+    assert np.sum(column * found[..., 0]) / np.sum(column**2) == pytest.approx(0.005)
+    assert found.shape == (5, 30, 3 + 2 * 4) and not found[..., 1:3].any()
+    for cells in np.split(found[..., 3:], 2, axis=2):  # by speed, by position: each node is in one cell
+        np.testing.assert_allclose(cells.sum(2), 0.01 * D.sum(2))
+    assert not doubts.common(SimpleNamespace(), D, np.zeros(1)).size
