@@ -232,11 +232,11 @@ class Estimated:
         step: most probable step `[k]` from the answer's fit, of residuals `[W, n]` at its values.
     """
 
-    mean: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    mean: Array
+    covariance: Array
     sheet: Posterior
-    noise: NDArray[np.float64]
-    step: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    noise: Array
+    step: Callable[[Array], Array]
 
 
 def at_its_mean(weighing: Weighing, key: Key) -> Model:
@@ -259,8 +259,7 @@ def at_its_mean(weighing: Weighing, key: Key) -> Model:
     else:
         if weighing.scored[key].found.nats < old.found.nats - np.log(ODDS.mention):
             state.models[key], weighing.scored[key] = old.model, old
-    (model,) = heldout.refitted(fitter, [state.models[key]])
-    state.models[key] = model
+    state.models[key] = model = heldout.refitted(fitter, state.models[key])
     weighing.scored[key] = replace(weighing.scored[key], model=model)
     return model
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,47 +39,31 @@ class Prediction:
 
 def predict(fitter: Fitter, model: Model) -> Prediction:
     """Simulate each condition's windows with the parameters found without it; starts re-estimated on the window."""
-    return predictions(fitter, [model])[0]
-
-
-def predictions(fitter: Fitter, models: Sequence[Model]) -> list[Prediction]:
-    """`predict` of several models, simulated together."""
     _, fold = np.unique(fitter.simulator.windows.group, return_inverse=True)
-    thetas = [[fitter.vector(m.fit.coordinates, values) for values in m.estimates] for m in models]
-    return _settled(fitter, [m.fit for m in models], np.array(thetas), fold)
+    thetas = [fitter.vector(model.fit.coordinates, values) for values in model.estimates]
+    return _settled(fitter, model.fit, np.array(thetas), fold)
 
 
-def costs(fitter: Fitter, model: Model, seen: Prediction) -> Array:
-    """Costs `[W]` of a prediction with the uncertainty of what it was made with, in the units of `Model.cost`."""
-    fit, steps = model.fit, fitter.simulator.windows.steps
-    plain = seen.cost(steps) * fitter.size + np.sum((seen.offsets / fitter.spread) ** 2, axis=1)
-    q, _ = eliminate(seen.error.reshape(len(plain), -1), fit.A, fit.B, seen.offsets, fitter.spread)
-    return fitter.innovations(fit, np.zeros_like(model.estimates), model.estimates, plain, at=q)
-
-
-def refitted(fitter: Fitter, models: Sequence[Model]) -> list[Model]:
-    """The models with estimates without each condition that come of fits without it, all in lockstep.
+def refitted(fitter: Fitter, model: Model) -> Model:
+    """Take estimates without each condition that come of fits without it, all in lockstep.
 
     In the search one linear step from the common fit stands for such a fit: good enough to rank by, but where numbers
     are hardly told (a wind's sideways force) it can lead where the model is no longer linear. A condition that alone
     tells a parameter is held out in parts (`Fitter.scores`): its linear steps stay.
     """
-    group = fitter.simulator.windows.group
-    names = np.unique(group)
-    alone = [fitter.told_alone(m.fit) for m in models]
-    plans = [(i, g) for i in range(len(models)) for g in range(len(names)) if not alone[i][g]]
-    folds = [_Fold(fitter, models[i], group != names[g]) for i, g in plans]
+    group, estimates = fitter.simulator.windows.group, model.estimates.copy()
+    alone = zip(np.unique(group), fitter.told_alone(model.fit), strict=True)
+    folds = {g: _Fold(fitter, model, group != name) for g, (name, told) in enumerate(alone) if not told}
     for _ in range(EFFORT.rounds):
-        if not (running := [fold for fold in folds if not fold.rests]):
+        if not (running := [fold for fold in folds.values() if not fold.rests]):
             break
         thetas = np.stack([fitter.vector(fold.fit.coordinates, fold.values) for fold in running])
         seen = fitter.whiten(fitter.simulator.run(thetas, np.stack([fold.offsets for fold in running])))
         for fold, r in zip(running, seen, strict=True):
             fold.go_on(r)
-    estimates = [m.estimates.copy() for m in models]
-    for (i, g), fold in zip(plans, folds, strict=True):
-        estimates[i][g] = fold.found
-    return [replace(m, estimates=e) for m, e in zip(models, estimates, strict=True)]
+    for g, fold in folds.items():
+        estimates[g] = fold.found
+    return replace(model, estimates=estimates)
 
 
 class _Fold:
@@ -143,32 +126,25 @@ def noise_floor(fitter: Fitter, fit: Fit, noise: Array) -> Array:
 def nominal(fitter: Fitter, fit: Fit) -> Prediction:
     """The simulator as delivered, starts estimated."""
     theta = fitter.vector(fit.coordinates, np.array([c.neutral for c in fit.coordinates]))
-    return _settled(fitter, [fit], theta[None, None], np.zeros(len(fit.r), int))[0]
+    return _settled(fitter, fit, theta[None], np.zeros(len(fit.r), int))
 
 
-def _settled(fitter: Fitter, fits: Sequence[Fit], thetas: Array, of_theta: NDArray[np.int64]) -> list[Prediction]:
-    """All windows after two Newton steps of their start states.
-
-    thetas: `[fits, g, P]`; of_theta: `[W]`, which of a fit's thetas is a window's.
-    """
-    count, windows = len(fits), len(of_theta)
-    own = (np.arange(count)[:, None] * thetas.shape[1] + of_theta).ravel(), np.tile(np.arange(windows), count)
-    B = np.concatenate([fit.B for fit in fits])
+def _settled(fitter: Fitter, fit: Fit, thetas: Array, of_theta: NDArray[np.int64]) -> Prediction:
+    """All windows after two Newton steps of their start states; thetas: `[g, P]`; of_theta: `[W]`, a window's."""
+    own = of_theta, np.arange(len(of_theta))
 
     def simulated(offsets: Array) -> Array:
-        return fitter.whiten(fitter.simulator.run_each(thetas.reshape(-1, thetas.shape[2]), *own, offsets))
+        return fitter.whiten(fitter.simulator.run_each(thetas, *own, offsets))
 
-    offsets = np.concatenate([fit.offsets for fit in fits])
+    offsets, none = fit.offsets, np.zeros((*fit.r.shape, 0))
     r = simulated(offsets)
-    none = np.zeros((*r.shape, 0))
     for _ in range(2):
-        _, starts = eliminate(r, none, B, offsets, fitter.spread)
+        _, starts = eliminate(r, none, fit.B, offsets, fitter.spread)
         moved = offsets + starts.step(none, np.zeros(0))
         new = simulated(moved)
         better = (np.sum(new**2, 1) < np.sum(r**2, 1))[:, None]
         r, offsets = np.where(better, new, r), np.where(better, moved, offsets)
-    errors = r.reshape(count, windows, fitter.simulator.windows.steps, -1)
-    return [Prediction(*pair) for pair in zip(errors, np.split(offsets, count), strict=True)]
+    return Prediction(r.reshape(len(r), fitter.simulator.windows.steps, -1), offsets)
 
 
 def stages(costs: dict[str, Array], group: NDArray[np.int64]) -> dict[str, Any]:
