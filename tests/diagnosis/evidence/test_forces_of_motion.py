@@ -1,5 +1,6 @@
 """Forces that a motion takes, by hand, and what a common error of them does to a number that takes it."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import mujoco
@@ -7,6 +8,12 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.evidence import doubts
+from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, marginal
+from bayessim_mjx.diagnosis.evidence.parameters import belief_of
+from bayessim_mjx.diagnosis.evidence.weighing import Weighing, _taken
+from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
+from bayessim_mjx.diagnosis.fitting.fit import Fit
+from tests.diagnosis.evidence.linear import CHANNELS, SPREAD, STARTS, draw
 
 SERVO = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping=".3" stiffness="2" armature=".05"/>
   <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5" mass="1.5"/></body></worldbody>
@@ -40,3 +47,26 @@ def test_a_number_that_takes_a_common_force_is_as_uncertain_as_that_force(monkey
     for cells in np.split(found[..., 3:], 2, axis=2):  # by speed, by position: each node is in one cell
         np.testing.assert_allclose(cells.sum(2), 0.01 * D.sum(2))
     assert not doubts.common(SimpleNamespace(), D, np.zeros(1)).size
+
+
+def test_numbers_take_common_errors_as_a_fit_to_them_would():
+    """Each error added to the residuals moves the most probable numbers; one that rests at a bound stays there."""
+    case, hyper = draw(3, k=3), Hyper(np.array([0.02]), 4.0, np.array([1.0, 1.2]))
+    count, errors = len(case.r), np.random.default_rng(1).normal(size=(*case.r.shape, 2))
+    coordinates = tuple(Coordinate(str(i), (i,), 0.0, -50.0, 50.0, 1.0) for i in range(3))
+    fit = Fit(coordinates, np.zeros(3), np.zeros((count, STARTS)), case.r, case.A, case.B, np.ones(count), 0.0)
+    weighing = Weighing.__new__(Weighing)
+    weighing.state = SimpleNamespace(fitter=SimpleNamespace(spread=np.full(STARTS, SPREAD)))
+    weighing.D, weighing.scale, weighing.channels = case.D, case.scale, CHANNELS
+
+    def best(r):
+        own = dataclasses.replace(fit, r=r)
+        return belief_of(own).best(marginal(weighing.windows(own), hyper).Q.sum(0))
+
+    moves = np.array([best(case.r + errors[..., i]) - best(case.r) for i in range(2)])
+    learnt, model = SimpleNamespace(hyper=hyper), SimpleNamespace(fit=fit)
+    of = SimpleNamespace(fit=fit, learnt=learnt, model=model, found=SimpleNamespace(free=np.ones(3, bool)))
+    np.testing.assert_allclose(_taken(weighing, of, errors), moves.T @ moves, rtol=1e-6)
+    of.found.free = np.array([True, False, True])
+    held = _taken(weighing, of, errors)
+    assert not held[1].any() and held[0, 0] > 0
