@@ -22,7 +22,14 @@ from bayessim_mjx.tasks.locomotion import Locomotion
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = ("main", "train", "play", "calibrate", "diagnose", "blind", "gap_loop", "logs", "implementations")
-FORMATS = ("check", "from-mcap", "from-rosbag", "from-lerobot", "from-hdf5", "from-pace")  # of `logs`, each with flags of its own
+FORMATS = (
+    "check",
+    "from-mcap",
+    "from-rosbag",
+    "from-lerobot",
+    "from-hdf5",
+    "from-pace",
+)  # of `logs`, each with flags of its own
 FOLDERS = ("docs", "benchmarks")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(p for f in FOLDERS for p in sorted((ROOT / f).rglob("*.md")))]
 PYTHON = {"env.reset", "env.step", "env.dt", "env.mj_model", "env.space", "ppo.train"}  # in Python, not settings

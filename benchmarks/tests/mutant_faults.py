@@ -159,7 +159,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     # diagnosis
     (
-        "superfluous effects stay in the answer", f"{P}/diagnosis/evidence/sets.py",
+        "superfluous effects stay in the answer", f"{P}/diagnosis/evidence/weighing.py",
         "limit = excess[key] +", "limit = 0.0 * excess[key] - 1.0 +", (SETS,),
     ),
     (

@@ -8,13 +8,12 @@ servo or of the joint, moves the inertia: through a motor's inductance, or in a 
 before the step.
 
 The missing force of one window is independent of that of another. A law that is not quite right is wrong in all of them
-alike, and parameters take it (`covariance`): an error of the missing force's size, with the shape of the forces by
-inertia, by speed or by position.
+alike, wherever the motion is the same, and numbers take it: `common` has errors of the missing force's size that are
+functions of the state (Kennedy and O'Hagan, J. R. Stat. Soc. B 63, 2001).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -40,9 +39,13 @@ class Doubts:
     columns: Array
     as_known: Array
 
-    def of(self, fit: Fit) -> Array:
-        """`[W, n, T]`, beside the numbers of a fit."""
-        return np.asarray(self.columns + fit.A[:, :, : len(self.as_known)] @ self.as_known)
+    def beside(self, fit: Fit) -> Fit:
+        """The fit with these numbers behind its own, in units of their priors."""
+        own = np.asarray(self.columns + fit.A[:, :, : len(self.as_known)] @ self.as_known)
+        names = [f"doubt{i}" for i in range(own.shape[2])]
+        more = tuple(Coordinate(name, (), 0.0, -np.inf, np.inf, 1.0, "", stated=True) for name in names)
+        values = np.concatenate([fit.values, np.zeros(len(more))])
+        return replace(fit, coordinates=(*fit.coordinates, *more), values=values, A=np.concatenate([fit.A, own], 2))
 
 
 def found(fitter: Fitter, D: Array, B: Array) -> Doubts:
@@ -122,65 +125,63 @@ def _rates(fitter: Fitter, rows: NDArray[np.int64]) -> tuple[Array, Array]:
     return np.stack([speeds[log][own] for log, own in at]), np.stack([slopes[log][own] for log, own in at])
 
 
-def doubted(fit: Fit, doubts: Doubts) -> Fit:
-    """The fit with these numbers behind its own, in units of their priors."""
-    own = doubts.of(fit)
-    more = tuple(Coordinate(f"doubt{i}", (), 0.0, -np.inf, np.inf, 1.0, "", stated=True) for i in range(own.shape[2]))
-    values = np.concatenate([fit.values, np.zeros(len(more))])
-    return replace(fit, coordinates=(*fit.coordinates, *more), values=values, A=np.concatenate([fit.A, own], 2))
+def common(fitter: Fitter, D: Array, size: Array) -> Array:
+    """`[W, n, c]`: what one standard deviation of forces that are alike in all windows does to the residuals.
 
-
-def covariance(fitter: Fitter, D: Array, size: Array, step: Callable[[Array], Array], r: Array) -> Array:
-    """`[k, k]`, of numbers that take a force which is the same in all windows.
+    Each is as large as the missing force. They are M a, the model's forces by speed and by position, and for each joint
+    any function of its speed and any of its position: values of their own in as many cells of the motion as a window
+    has nodes, all as full.
 
     Args:
         D: as in `disturbance.columns`; size: `[nv]`, rms of the missing force, N m or N.
-        step: most probable step of the numbers of residuals `[W, n]`; r: those of the fit.
     """
-    here, nv = step(r), len(size)
+    nodes, out = D.shape[2] // len(size), [np.zeros((*D.shape[:2], 0))]
     if not size.any():
-        return np.zeros((len(here), len(here)))
-    nodes, out = D.shape[2] // nv, []
-    forces = of_motion(fitter, nodes)
+        return out[0]
+    forces, states = of_motion(fitter, nodes)
     rms = np.sqrt(np.mean(forces**2, axis=(0, 3), keepdims=True))
-    forces = forces / np.where(rms > 0, rms, np.inf) * size[:, None]
-    for kind in range(forces.shape[1]):
-        for joint in np.flatnonzero(size):
-            own = D[:, :, joint * nodes : (joint + 1) * nodes] @ forces[:, kind, joint, :, None]
-            out.append(step(r + own[..., 0]) - here)
-    moves = np.array(out)
-    return np.asarray(moves.T @ moves)
+    forces = forces / np.where(rms > 0, rms, np.inf)
+    for joint in np.flatnonzero(size):
+        cells = [
+            np.searchsorted(np.quantile(x, np.arange(1, nodes) / nodes), x)[:, None] == np.arange(nodes)[:, None]
+            for x in states[:, :, joint].swapaxes(0, 1)
+        ]
+        shapes = np.concatenate([forces[:, :, joint], *cells], 1) * size[joint]
+        out.append(D[:, :, joint * nodes : (joint + 1) * nodes] @ shapes.mT)
+    return np.concatenate(out, 2)
 
 
-def of_motion(fitter: Fitter, nodes: int) -> Array:
-    """`[W, 3, nv, m]`, N m or N: M a, forces by speed, forces by position, along the logged motion at the nodes."""
+def of_motion(fitter: Fitter, nodes: int) -> tuple[Array, Array]:
+    """Forces `[W, 3, nv, m]`, N m or N: M a, by speed, by position; speeds and positions `[W, 2, nv, m]`, at nodes."""
     windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
     data, count = mujoco.MjData(model), windows.steps
-    at = (np.arange(nodes) + 0.5) * count / nodes
-    out = np.zeros((len(windows), 3, model.nv, nodes))
+    at = np.clip(((np.arange(nodes) + 0.5) * count / nodes).round().astype(int), 0, count)
+    out = np.zeros((len(windows), 5, model.nv, nodes))
     for w, (log, start) in enumerate(zip(windows.log, windows.start, strict=True)):
         rows = start + np.arange(count + 1)
         qpos, qvel = windows.logs[log].qpos[rows], windows.logs[log].qvel[rows]
         qacc = np.gradient(qvel, windows.dt, axis=0)
-        for m, row in enumerate(np.clip(at.round().astype(int), 0, count)):
+        for m, row in enumerate(at):
             out[w, :, :, m] = _at(model, data, qpos[row], qvel[row], qacc[row])
-    return np.nan_to_num(out)
+    out = np.nan_to_num(out)
+    return out[:, :3], out[:, 3:]
 
 
 def _at(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array, qvel: Array, qacc: Array) -> Array:
-    """`[3, nv]` at one state."""
+    """`[5, nv]` at one state."""
     data.qpos[:], data.qvel[:] = qpos, 0.0
     mujoco.mj_fwdPosition(model, data)
     mujoco.mj_fwdVelocity(model, data)
     by_position = data.qfrc_bias - data.qfrc_passive
-    inertial = np.zeros(model.nv)
+    inertial, position = np.zeros((2, model.nv))
     mujoco.mj_mulM(model, data, inertial, np.ascontiguousarray(qacc))
+    mujoco.mj_differentiatePos(model, position, 1.0, model.qpos0, np.ascontiguousarray(qpos))
     data.qvel[:] = qvel
     mujoco.mj_fwdVelocity(model, data)
     by_speed = data.qfrc_bias - data.qfrc_passive - by_position
     affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
     drives = np.where(affine, model.actuator_biasprm[:, 2], 0.0) * data.actuator_velocity
-    return np.stack([inertial, by_speed - drives @ moments(model, data), by_position])
+    return np.stack([inertial, by_speed - drives @ moments(model, data), by_position, qvel, position])
 
 
 def moments(model: mujoco.MjModel, data: mujoco.MjData) -> Array:

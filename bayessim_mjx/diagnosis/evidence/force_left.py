@@ -27,12 +27,11 @@ from bayessim_mjx.diagnosis.evidence.gaussian import (
     Learnt,
     Marginal,
     Windows,
-    marginal,
+    learn,
 )
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.selection.models import Key
-from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 from bayessim_mjx.diagnosis.statistics import Z90
 
 Array = NDArray[np.float64]
@@ -83,8 +82,7 @@ class ForceLeft:
 def of_set(weighing: Weighing, key: Key) -> ForceLeft:
     """The posterior of the force that a weighed set of effects leaves."""
     found = weighing.scored[key]
-    windows = weighing.windows(found.fit, found.fit.r)
-    return force_left(windows, belief_of(found.fit), found.learnt, weighing.scale)
+    return force_left(weighing.windows(found.fit), belief_of(found.fit), found.learnt, weighing.scale)
 
 
 def force_left(windows: Windows, belief: Belief, learnt: Learnt, scale: Array) -> ForceLeft:
@@ -94,6 +92,8 @@ def force_left(windows: Windows, belief: Belief, learnt: Learnt, scale: Array) -
         windows, belief: of the fit; learnt: their best hyperparameters; scale: `[nv]`, the robot's force scale.
     """
     hyper, forces = learnt.hyper, _Forces.of(windows, belief, learnt.marginal)
+    least = replace(hyper, amplitude=np.full_like(hyper.amplitude, PRIORS.least))
+    none = learn(windows, belief, [least], most=PRIORS.least)  # no force above the least one, the noise at its best
     slope, curvature, shared = forces.in_amplitude(hyper)
     free = hyper.amplitude > PRIORS.least * (1 + 1e-6)
     sizes, ways = np.linalg.eigh(curvature[np.ix_(free, free)])
@@ -114,7 +114,7 @@ def force_left(windows: Windows, belief: Belief, learnt: Learnt, scale: Array) -
         amplitude=hyper.amplitude * scale,
         low=factor[0] * hyper.amplitude * scale,
         high=factor[1] * hyper.amplitude * scale,
-        nats=float(_density(belief, learnt.marginal, hyper) + prior + volume - _without(windows, belief, hyper)),
+        nats=float(_density(belief, learnt) + prior + volume - _density(belief, none)),
         motion=mean / rows,
         sd=float(np.sqrt(variance + shared[free] @ inverse @ shared[free])) / rows,
         by_joint=by_joint / rows,
@@ -138,28 +138,10 @@ def _at_the_end(slope: float, curvature: float) -> tuple[float, float]:
     return float(np.log(below[-1])), float(np.exp(np.interp(ENDS[1] * below[-1], below, logs)))
 
 
-def _density(belief: Belief, there: Marginal, hyper: Hyper) -> float:
+def _density(belief: Belief, learnt: Learnt) -> float:
     """Log density of the data at the most probable step, with the noise's prior."""
-    Q = there.Q.sum(0)
-    noise = float(np.sum((np.log(hyper.noise) / PRIORS.noise) ** 2))
-    return -0.5 * (belief.cost(Q, belief.best(Q)) + float(there.logdet.sum()) + noise)
-
-
-def _without(windows: Windows, belief: Belief, hyper: Hyper) -> float:
-    """The log density with no force above the least one, the noise at its best (expectation maximisation)."""
-    own, count, last = 1 + windows.parameters, windows.gram.shape[1], -np.inf
-    hyper = replace(hyper, amplitude=np.full_like(hyper.amplitude, PRIORS.least))
-    while True:
-        there = marginal(windows, hyper)
-        value = _density(belief, there, hyper)
-        if not value - last >= EFFORT.tolerance:  # NaN ends it too
-            return max(value, last)
-        one = np.concatenate([[1.0], -belief.best(there.Q.sum(0))])
-        along = np.concatenate([np.tile(one, (count, 1)), -there.mean @ one @ there.root.T], 1)
-        outer = along[:, :, None] * along[:, None, :]
-        outer[:, own:, own:] += there.root @ there.cov @ there.root.T
-        square = windows.gram.reshape(len(windows.gram), -1) @ outer.ravel()  # expected square of the residual
-        last, hyper = value, replace(hyper, noise=np.sqrt(square / (windows.rows * count)))
+    noise = float(np.sum((np.log(learnt.hyper.noise) / PRIORS.noise) ** 2))
+    return -0.5 * (belief.cost(learnt.Q, learnt.step) + float(learnt.marginal.logdet.sum()) + noise)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ nearly right leaves a small force, not hundreds of noise standard deviations.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -58,10 +58,6 @@ class Windows:
     def memories(self) -> list[float]:
         """Of the force that are tried, in node spacings: powers of 4, from white to the length of a window."""
         return [4.0**n for n in range((1 + self.nodes.bit_length()) // 2)]
-
-    def some(self, rows: NDArray[np.bool_]) -> Windows:
-        """Some of the windows."""
-        return replace(self, gram=self.gram[:, rows])
 
 
 def windows_of(
@@ -169,11 +165,13 @@ class Learnt:
         return self.penalty - 0.5 * float(self.marginal.logdet.sum())
 
 
-def learn(windows: Windows, belief: Belief, like: Sequence[Hyper] = ()) -> Learnt:
-    """The best hyperparameters, by quasi-Newton steps (exact gradients by Fisher's identity) for each memory.
+def learn(windows: Windows, belief: Belief, like: Sequence[Hyper] = (), most: float = 10.0) -> Learnt:
+    """Find the best hyperparameters, by quasi-Newton steps (exact gradients by Fisher's identity) for each memory.
 
-    like: of models of the same windows with one memory, which stays; the search begins at the best of them. Empty: all
-    memories are tried.
+    Args:
+        like: of models of the same windows with one memory, which stays; the search begins at the best of them. Empty:
+            all memories are tried.
+        most: of the force's amplitude, in shares of the force scale.
     """
     nv, channels = windows.joints, len(windows.gram)
     starts = [np.concatenate([np.full(nv, np.log(PRIORS.usual)), np.zeros(channels)])]
@@ -181,12 +179,17 @@ def learn(windows: Windows, belief: Belief, like: Sequence[Hyper] = ()) -> Learn
     if like:
         starts, memories = [np.log(np.concatenate([h.amplitude, h.noise])) for h in like], [like[0].memory]
     start = min(starts, key=lambda x: _slope(x, windows, belief, memories[0])[0]) if len(starts) > 1 else starts[0]
-    ends: Array = np.array([(np.log(PRIORS.least), np.log(10.0))] * nv + [(-2.0, 7.0)] * channels)
+    ends: Array = np.array([(np.log(PRIORS.least), np.log(most))] * nv + [(-2.0, 7.0)] * channels)
     unit = _precision(windows) ** -0.5
     best: Any = None
+
+    def scaled(x: Array, memory: float) -> tuple[float, Array]:
+        value, slope = _slope(x * unit, windows, belief, memory)
+        return value, slope * unit
+
     for memory in memories:
         found = minimize(
-            _scaled, start / unit, (unit, windows, belief, memory), "L-BFGS-B", jac=True, bounds=ends / unit[:, None],
+            scaled, start / unit, memory, "L-BFGS-B", jac=True, bounds=ends / unit[:, None],
             options={"ftol": np.finfo(np.float32).eps},  # products of residuals in single precision are no better
         )  # fmt: skip
         start = found.x * unit
@@ -203,11 +206,6 @@ def _precision(windows: Windows) -> Array:
     force = 2 * windows.nodes * count + PRIORS.spread**-2
     noise = 2 * windows.rows * count + PRIORS.noise**-2
     return np.concatenate([np.full(windows.joints, force), np.full(channels, noise)])
-
-
-def _scaled(x: Array, unit: Array, windows: Windows, belief: Belief, memory: float) -> tuple[float, Array]:
-    value, slope = _slope(x * unit, windows, belief, memory)
-    return value, slope * unit
 
 
 def _hyper(x: Array, nv: int, memory: float) -> Hyper:

@@ -1,13 +1,22 @@
-"""Relations between laws: which may be in one model, which may replace another, and where a replacement begins.
+"""Relations between laws: which may be in one model, which may replace another, and which one hides.
 
-A payload, a centre of mass that is off and a link's mass change the same ten numbers of a body. A fit from elsewhere
-comes to rest far from them: a payload's place hardly moves anything as long as its mass is wrong.
+**Replacement.** A payload, a centre of mass that is off and a link's mass change the same ten numbers of a body. A fit
+from elsewhere comes to rest far from them: a payload's place hardly moves anything as long as its mass is wrong.
+
+**Hidden** (`by_effects`). A bias beside a spring moves the spring's angle of rest; viscous friction beside friction by
+direction is part of it. Such logs do not tell whether both are there: the named law stands for both.
+
+**Stand-ins** (`by_parameters`). A joint's viscous friction is its damping, rotor inertia beside a slide is its mass, a
+drive's gain is all of the robot's inertia, damping and friction together. The prior decides whether the data sheet is
+wrong or an effect is missing.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +25,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from bayessim_mjx.diagnosis.fitting.candidates import Candidate
-from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from bayessim_mjx.diagnosis.data_sheet import SURE
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
+from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial
+from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, HIDDEN, ODDS
+from bayessim_mjx.diagnosis.selection.screen import Column, Projection, Screened, judged, looked_at, part, simulated
+from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.effects import load, names
 from bayessim_mjx.parameters import geometry
 from bayessim_mjx.physics import Physics
 
 Array = NDArray[np.float64]
+AMOUNTS = np.linspace(0.0, 1.0, 101)[1:]  # of an effect, shares of the largest in its range
 SINGLE = float(np.finfo(np.float32).eps) ** 0.5  # of inertias in single precision: best step of a difference, of 1
 
 
@@ -54,8 +69,8 @@ def related(one: Candidate, other: Candidate) -> bool:
 
 def same_lateness(one: Candidate, other: Candidate, model: mujoco.MjModel) -> bool:
     """Whether both make a signal of the same joint late: a delay T and a lag T shift slow signals alike, by T."""
-    late = one.effect != other.effect and _late(one.effect) and _late(other.effect)
-    return late and _joint(one, model) == _joint(other, model)
+    late = one.effect != other.effect and _said(one.effect, "late") and _said(other.effect, "late")
+    return bool(late) and _joint(one, model) == _joint(other, model)
 
 
 def _joint(c: Candidate, model: mujoco.MjModel) -> str:
@@ -70,27 +85,18 @@ def _joint(c: Candidate, model: mujoco.MjModel) -> str:
 def inertia(one: Candidate, other: Candidate) -> bool:
     """Whether both change the inertia of the same body."""
     here = one.kind == other.kind == "body" and one.where == other.where and one.effect != other.effect
-    return here and _inertial(one.effect) and _inertial(other.effect)
+    return here and bool(_said(one.effect, "inertial") and _said(other.effect, "inertial"))
 
 
 def special_cases(effect: Candidate) -> tuple[str, ...]:
     """Names of the effects that are special cases of it, from its class."""
-    return _contained(effect.effect)
+    return tuple(_said(effect.effect, "contains"))
 
 
 @functools.cache  # thousands of pairs are compared, and all installed packages are looked through for a name
-def _contained(effect: str) -> tuple[str, ...]:
-    return tuple(getattr(load(effect), "contains", ())) if effect in names() else ()
-
-
-@functools.cache
-def _late(effect: str) -> bool:
-    return effect in names() and bool(load(effect).late)
-
-
-@functools.cache
-def _inertial(effect: str) -> bool:
-    return effect in names() and bool(load(effect).inertial)
+def _said(effect: str, attribute: str) -> Any:
+    """What an effect's class says of it."""
+    return getattr(load(effect), attribute, ()) if effect in names() else ()
 
 
 def as_large(one: Candidate, other: Candidate, values: Array) -> tuple[Array, ...]:
@@ -183,3 +189,111 @@ def _parts(physics: Physics, theta: jax.Array) -> tuple[jax.Array, jax.Array, ja
     )
     turn = jax.vmap(geometry.rotation)(frame)
     return mass, place - physics.model.body_ipos, jnp.einsum("bij,bj,bkj->bik", turn, moments, turn)
+
+
+def by_effects(state: SearchState, answer: Model, say: Progress = lambda text, done, total: None) -> tuple[str, ...]:
+    """List the labels of candidates that the answer's effects hide, and that show without these effects."""
+    if not answer.effects:
+        return ()
+    others = [c for c in state.candidates if all(compatible(c, e) for e in answer.effects)]
+    alone, likely = _shown(state, state.base, others), _shown(state, answer, others)
+    shown = 1.0 - (1.0 - HIDDEN) ** 0.5  # halfway, on a log scale, between what is hidden and what shows wholly
+    some = [label for label in likely if alone[label][0][0].absorbed < shown < likely[label][0][0].absorbed]
+    some = sorted(some, key=lambda label: -likely[label][0][0].absorbed)[: EFFORT.batch]
+    plans = [(s.candidate, point) for label in some for s, point in likely[label][: EFFORT.points]]
+    own = looked_at(answer.fit, state.settings.screened)
+    columns = simulated(state.fitter, answer.fit, plans, own, lambda _, done, all_: say("hidden", done, all_))
+    found = judged(state.fitter, answer.fit, columns, own)
+    return tuple(label for label, each in found.items() if min(s.absorbed for s, _ in each) > HIDDEN)
+
+
+def _shown(
+    state: SearchState, model: Model, candidates: Sequence[Candidate]
+) -> dict[str, list[tuple[Screened, Array]]]:
+    """{label: what is hidden of it at each starting point}, what shows most first, without a simulation."""
+    found = judged(state.fitter, model.fit, state.secants.of(candidates), state.secants.own)
+    return {label: sorted(several, key=lambda pair: pair[0].absorbed) for label, several in found.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class StandIn:
+    """An effect that may do the work of a known parameter's deviation from the data sheet.
+
+    Attributes:
+        nats: by which the known parameters are likelier; column: of the effect, at one of its points.
+        point: `[k]`, its numbers in the best amount; steps: `[k]`, of the fit's numbers that this amount does.
+        parameter: index of the known one that gains most.
+    """
+
+    nats: float
+    column: Column
+    point: Array
+    steps: Array
+    parameter: int
+
+
+def by_parameters(state: SearchState, answer: Model) -> dict[str, tuple[str, ...]]:
+    """List {known parameter: labels of the effects that it may stand for}, without a simulation (`stand_ins`)."""
+    out: dict[str, tuple[str, ...]] = {}
+    for found in stand_ins(state, answer):
+        name = answer.fit.names[found.parameter]
+        out[name] = (*out.get(name, ()), found.column.candidate.label)
+    return out
+
+
+def stand_ins(state: SearchState, answer: Model) -> list[StandIn]:
+    """Find effects that known parameters may stand for.
+
+    An effect stands beside a parameter's deviation where known parameters do all its work (`HIDDEN`), and
+    where the data sheet speaks for it: without the effect's part the parameters are so much likelier that the odds
+    against the effect, one of all candidates and in its best size, are below `ODDS.strong`, and by `ODDS.mention` at
+    least. Beside the best one stand those that the data sheet does not speak strongly against; then what it leaves is
+    looked at in the same way.
+    """
+    columns = state.secants.of(c for c in state.candidates if all(compatible(c, e) for e in answer.effects))
+    columns = [c for c in columns if c.way.any()]
+    if not columns:
+        return []
+    fit = part(answer.fit, state.secants.own)
+    project = Projection(state.fitter, fit)
+    works = [(c, steps) for c in columns if (steps := project.taken(c.change, HIDDEN)) is not None]
+    least = max(-state.log_prior(frozenset("x")) - np.log(ODDS.strong), np.log(ODDS.mention))
+    away, out = fit.values - np.array([c.neutral for c in fit.coordinates]), list[StandIn]()
+    while works:
+        gains: dict[str, StandIn] = {}
+        for column, steps in works:
+            gain, old = _gain(fit, away, column, steps), gains.get(column.candidate.label)
+            gains[column.candidate.label] = gain if old is None or gain.nats > old.nats else old
+        best = max(gains.values(), key=lambda gain: gain.nats)
+        if best.nats <= least:
+            break
+        now = {label: g for label, g in gains.items() if g.nats > max(least, best.nats - np.log(ODDS.strong))}
+        out += now.values()
+        works = [(column, steps) for column, steps in works if column.candidate.label not in now]
+        away = away - best.steps
+    return out
+
+
+def _gain(fit: Fit, away: Array, column: Column, steps: Array) -> StandIn:
+    """In its best amount, of parameters so far from the data sheet `[k]`; steps: that do the work of the column."""
+    amounts = np.array([end * AMOUNTS for end in column.room if np.isfinite(end)]).ravel()
+    amounts = np.append(amounts, 0.0)  # none
+    gains = [_far(fit.coordinates, away) - _far(fit.coordinates, away - t * steps) for t in amounts]
+    amount = float(amounts[np.argmax(gains)])
+    precision = np.array([c.precision if c.stated or c.kind else 0.0 for c in fit.coordinates])
+    parameter = int(np.argmax(precision * (away**2 - (away - amount * steps) ** 2)))
+    return StandIn(max(gains), column, column.at(amount), amount * steps, parameter)
+
+
+def _far(coordinates: Sequence[Coordinate], away: Array) -> float:
+    """Minus the log prior density of known parameters so far from the data sheet, up to a constant.
+
+    Of a kind whose accuracy nobody stated a multivariate Student t (`accuracy`), of stated ones a Gaussian.
+    """
+    squares = np.array([c.precision for c in coordinates]) * away**2
+    kinds = np.array([c.kind for c in coordinates])
+    total = 0.5 * float(squares[[c.stated and not c.kind for c in coordinates]].sum())
+    for kind in {k for k in kinds if k}:
+        own = squares[kinds == kind]
+        total += 0.5 * (SURE + len(own)) * float(np.log1p(own.sum() / SURE))
+    return total

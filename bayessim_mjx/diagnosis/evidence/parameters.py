@@ -78,20 +78,10 @@ class Posterior:
         each = np.array([self.weight[np.isclose(shares, s)].sum() for s in LEVELS])
         edges = np.concatenate([[0.0], np.cumsum(each)])
         logs = np.log(LEVELS)
-        bins = np.concatenate(
-            [[1.5 * logs[0] - 0.5 * logs[1]], (logs[1:] + logs[:-1]) / 2, [1.5 * logs[-1] - 0.5 * logs[-2]]]
-        )
+        half = (logs[1] - logs[0]) / 2
+        bins = np.append(logs - half, logs[-1] + half)
         low, middle, high = np.exp(np.interp(ENDS, edges, bins))
         return float(low), float(middle), float(high)
-
-    def trust(self) -> dict[str, float]:
-        """{kind: mean factor of its priors' precision}."""
-        return dict(zip(self.kinds, map(float, self.weight @ (ACCURACY / self.shares) ** 2), strict=True))
-
-
-def kinds(fit: Fit) -> tuple[str, ...]:
-    """Kinds of parameters whose accuracy is inferred."""
-    return tuple(sorted({c.kind for c in fit.coordinates if c.kind}))
 
 
 def posterior(fit: Fit, curvature: Array, pull: Array | None = None) -> Posterior:
@@ -102,7 +92,7 @@ def posterior(fit: Fit, curvature: Array, pull: Array | None = None) -> Posterio
         pull: `[k]`, gradient of their log-likelihood there; None: the fit is the posterior's mode.
     """
     coordinates = fit.coordinates
-    found = kinds(fit)
+    found = tuple(sorted({c.kind for c in coordinates if c.kind}))  # whose accuracy is inferred
     own = np.array([[c.kind == kind for c in coordinates] for kind in found]).reshape(len(found), len(coordinates))
     stated = np.array([c.precision for c in coordinates])
     away = np.array([c.neutral for c in coordinates]) - fit.values
@@ -163,74 +153,57 @@ def integrated(fit: Fit, learnt: Learnt, effects: Sequence[Mapping[int, bool]] =
     c, g = c - 2 * g @ held + held @ S @ held, g - S @ held
     some = tuple(x for x, f in zip(fit.coordinates, free, strict=True) if f)
     reduced = replace(fit, coordinates=some, values=fit.values[free])
-    found = posterior(reduced, S[np.ix_(free, free)], g[free])
+    data = S[np.ix_(free, free)], g[free]
+    found = posterior(reduced, *data)
     nats = learnt.without_parameters - 0.5 * float(c) + found.evidence
     held_at = np.flatnonzero(at).tolist()
     layers = {i: _layer(belief, i, p[i], slope[i], S[i, i]) for i in held_at}
     beside = np.zeros(len(p))
     beside[held_at] = [_depth(slope[i], S[i, i] + belief.precision[i]) for i in held_at]
     nats += sum(layers.values(), 0.0) - sum(map(_truncated, fit.coordinates))
-    nats += sum(_sized(fit, found, free, layers, own) for own in effects)
+    nats += sum(_sized(fit, found, free, layers, own, data) for own in effects)
     # of a model so far off that rounding of its products leaves no covariance, nothing is known: it explains nothing
     return Integrated(nats if np.isfinite(nats) else -np.inf, found, free, beside)
 
 
-@dataclass(frozen=True, eq=False)
-class _Numbers:
-    """Posterior of the free numbers of a fit under one size of an effect.
-
-    Attributes:
-        middle, covariance: `[f]`, `[f, f]`; at: `[f]`, which numbers of the fit these are.
-        precision, inside: `[k]`, of all numbers' Gaussian priors; log probability that the bounds leave of it.
-    """
-
-    middle: Array
-    covariance: Array
-    at: NDArray[np.int64]
-    precision: Array
-    inside: Array
-
-    def smaller(self, some: Sequence[int], neutral: Array, fit: Fit, scale: float) -> tuple[_Numbers, float]:
-        """(these where the priors of some numbers are narrower by `scale`, log of the evidence's ratio)."""
-        if scale == 1.0 or not some:
-            return self, 0.0
-        inner = np.searchsorted(self.at, some)
-        more = (scale**-2.0 - 1.0) * self.precision[list(some)]
-        away = self.middle[inner] - neutral[list(some)]
-        together = self.covariance[np.ix_(inner, inner)] + np.diag(1 / more)
-        gain = np.linalg.solve(together, self.covariance[inner]).T
-        precision, inside = self.precision.copy(), self.inside.copy()
-        precision[list(some)] *= scale**-2.0
-        for i in some:
-            inside[i] = _truncated(fit.coordinates[i], scale)
-        ratio = -len(some) * np.log(scale) - 0.5 * float(np.linalg.slogdet(together)[1] + np.sum(np.log(more)))
-        ratio -= 0.5 * float(away @ np.linalg.solve(together, away)) + float(np.sum(inside - self.inside))
-        middle, covariance = self.middle - gain @ away, self.covariance - gain @ self.covariance[inner]
-        return _Numbers(middle, covariance, self.at, precision, inside), float(ratio)
-
-
 def _sized(
-    fit: Fit, found: Posterior, free: NDArray[np.bool_], layers: dict[int, float], own: Mapping[int, bool]
+    fit: Fit,
+    found: Posterior,
+    free: NDArray[np.bool_],
+    layers: dict[int, float],
+    own: Mapping[int, bool],
+    data: tuple[Array, Array],
 ) -> float:
     """What the evidence gains where an effect may be small: its range and parts of it are as likely (`Priors.sizes`).
 
     A prior as wide as the range alone would hold a small payload for less likely than a small error of a data sheet
     that does the same.
+
+    Args:
+        own: as in `integrated`; data: curvature and slope of the free numbers, as in `posterior`.
     """
-    neutral = np.array([c.neutral for c in fit.coordinates])
-    precision, inside = (np.array([of(c) for c in fit.coordinates]) for of in (lambda c: c.precision, _truncated))
-    numbers = _Numbers(found.middle, found.moments(), np.flatnonzero(free), precision, inside)
     some = [i for i, shape in own.items() if free[i] and not shape and not fit.coordinates[i].stated]
-    terms = []
+    several = len(own) > 1 and not all(own.values())
+    wide, terms = sum(_truncated(fit.coordinates[i]) for i in some), []
     for scale in PRIORS.sizes if some else PRIORS.sizes[:1]:
-        there, ratio = numbers.smaller(some, neutral, fit, scale)
-        several = len(own) > 1 and not all(own.values())
-        terms.append(ratio + (_without(fit, there, free, layers, own) if several else 0.0))
+        every = [
+            replace(c, precision=c.precision / scale**2 if i in some else c.precision)
+            for i, c in enumerate(fit.coordinates)
+        ]
+        here = tuple(c for c, f in zip(every, free, strict=True) if f)
+        there = found if scale == 1.0 else posterior(replace(fit, coordinates=here, values=fit.values[free]), *data)
+        ratio = there.evidence - found.evidence + wide - sum(_truncated(every[i]) for i in some)
+        terms.append(ratio + (_without(every, fit, there, free, layers, own) if several else 0.0))
     return float(logsumexp(terms) - np.log(len(terms)))
 
 
 def _without(
-    fit: Fit, found: _Numbers, free: NDArray[np.bool_], layers: dict[int, float], own: Mapping[int, bool]
+    coordinates: Sequence[Coordinate],
+    fit: Fit,
+    found: Posterior,
+    free: NDArray[np.bool_],
+    layers: dict[int, float],
+    own: Mapping[int, bool],
 ) -> float:
     """What the evidence gains where each of an effect's numbers may be neutral, with probability 1/2.
 
@@ -239,19 +212,20 @@ def _without(
     Savage and Dickey's ratio (Dickey, Ann. Math. Stat. 42, 1971): the evidence without a number is the posterior over
     the prior density at its neutral value.
     """
-    neutral = np.array([c.neutral for c in fit.coordinates])
+    middle, covariance, at = found.middle, found.moments(), np.cumsum(free) - 1
+    neutral, inside = np.array([c.neutral for c in coordinates]), [_truncated(c) for c in coordinates]
     usable = [i for i in own if free[i] or fit.values[i] == neutral[i]]
     amplitudes = {i for i, shape in own.items() if not shape}
     terms = [0.0]
     for some in itertools.chain.from_iterable(itertools.combinations(usable, n) for n in range(1, len(own))):
         if amplitudes <= {*some}:
             continue
-        inner = [int(np.searchsorted(found.at, i)) for i in some if free[i]]
-        delta = sum(found.inside[i] - layers.get(i, 0.0) for i in some)
-        if inner:
-            away, C = neutral[found.at[inner]] - found.middle[inner], found.covariance[np.ix_(inner, inner)]
+        delta = sum(inside[i] - layers.get(i, 0.0) for i in some)
+        if moving := [i for i in some if free[i]]:
+            inner = at[moving]
+            away, C = neutral[moving] - middle[inner], covariance[np.ix_(inner, inner)]
             delta -= 0.5 * float(away @ np.linalg.solve(C, away) + np.linalg.slogdet(C)[1])
-            delta -= 0.5 * float(sum(np.log(found.precision[i]) for i in some if free[i]))
+            delta -= 0.5 * float(sum(np.log(coordinates[i].precision) for i in moving))
         terms.append(delta)
     cases = (2 ** len(amplitudes) - 1) * 2 ** (len(own) - len(amplitudes))
     return float(logsumexp(terms) - np.log(cases))
@@ -276,8 +250,8 @@ def _depth(slope: float, curvature: float) -> float:
     return float(np.sqrt(hyperu(1.5, 0.5, half) / hyperu(0.5, 0.5, half)) / bend)
 
 
-def _truncated(c: Coordinate, scale: float = 1.0) -> float:
-    """Log of the prior probability that the bounds leave of an effect's Gaussian prior, narrower by `scale`."""
-    root = c.precision**0.5 / scale
+def _truncated(c: Coordinate) -> float:
+    """Log of the prior probability that the bounds leave of an effect's Gaussian prior."""
+    root = c.precision**0.5
     inside = ndtr((c.high - c.neutral) * root) - ndtr((c.low - c.neutral) * root)
     return 0.0 if c.stated else float(np.log(max(inside, 1e-300)))

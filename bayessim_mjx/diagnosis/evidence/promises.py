@@ -8,75 +8,24 @@ the best of the amplitude without it and parts of it (`Priors.sizes`) counts.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.evidence.gaussian import Belief, Hyper, correlation
+from bayessim_mjx.diagnosis.evidence.gaussian import Hyper
 from bayessim_mjx.diagnosis.evidence.laws import beside
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
-from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Key
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, PRIORS
-from bayessim_mjx.diagnosis.selection.screen import looked_at, room, simulated
+from bayessim_mjx.diagnosis.selection.screen import Column, looked_at, simulated
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Column:
-    """What one candidate does at one point.
-
-    Attributes:
-        candidate; point: `[k]`, where it was simulated; change: `[w, n]` of the residual.
-    """
-
-    candidate: Candidate
-    point: Array
-    change: Array
-
-    @property
-    def way(self) -> Array:
-        """`[k]` from neutral to the point; 0 for shapes."""
-        neutral = np.array([c.neutral for c in self.candidate.coordinates])
-        return np.where(self.candidate.shapes, 0.0, self.point - neutral)
-
-    @property
-    def room(self) -> tuple[float, float]:
-        return room(self.candidate, self.way)
-
-    @property
-    def precision(self) -> float:
-        """Of the multiple of the way, by the priors of the candidate's numbers."""
-        return float(sum(c.precision * w**2 for c, w in zip(self.candidate.coordinates, self.way, strict=True)))
-
-    def at(self, amount: float) -> Array:
-        """The point so many ways from neutral, within the ranges, and not at neutral, where many laws have no slope."""
-        low, high = (np.array([getattr(c, e) for c in self.candidate.coordinates]) for e in ("low", "high"))
-        neutral = np.array([c.neutral for c in self.candidate.coordinates])
-        amount = amount if abs(amount) > 0.02 else 0.02
-        moved = np.where(self.candidate.shapes, self.point, neutral + amount * self.way)
-        return np.clip(moved, low, high)
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """Some windows of a fit: `r [w, n]`, `A`, `D`, `B`, offsets as in `gaussian.windows_of`; share: of all windows."""
-
-    r: Array
-    A: Array
-    D: Array
-    B: Array
-    offsets: Array
-    spread: Array
-    scale: Array
-    channels: int
-    share: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +38,13 @@ class Promise:
 
 
 class Promises:
-    """Evidence of sets of columns on a fit, for several amplitudes of the force."""
+    """Evidence of sets of columns on a fit in some windows `own`, for several amplitudes of the force."""
 
-    def __init__(self, part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column]) -> None:
+    def __init__(
+        self, weighing: Weighing, fit: Fit, own: NDArray[np.int64], hyper: Hyper, columns: Sequence[Column]
+    ) -> None:
         self.columns = list(columns)
-        self.levels = [_level(part, belief, _scaled(hyper, f), self.columns) for f in PRIORS.sizes]
+        self.levels = [_level(weighing, fit, own, _scaled(hyper, f), self.columns) for f in PRIORS.sizes]
         self.base = max(level.base for level in self.levels)
 
     def pairs(self, blocked: NDArray[np.bool_], count: int) -> list[Promise]:
@@ -102,24 +53,17 @@ class Promises:
         gain[blocked] = -np.inf
         gain[np.tril_indices(len(gain))] = -np.inf
         best = np.argsort(-gain, axis=None)[:count]
-        return self.of([divmod(int(i), len(gain)) for i in best if np.isfinite(gain.flat[i])])
+        return [self.of(divmod(int(i), len(gain))) for i in best if np.isfinite(gain.flat[i])]
 
     def whole(self) -> Array:
         """`[P]`: log likelihood that each column gains at its point itself: of a limit a smaller part shows nothing."""
         level = self.levels[0]
         return level.g - 0.5 * np.diag(level.S)
 
-    def of(self, sets: Sequence[tuple[int, ...]]) -> list[Promise]:
-        return self._best([[level.of(own) for own in sets] for level in self.levels])
-
-    def _best(self, each: Sequence[Sequence[Promise]]) -> list[Promise]:
-        """Of each set, the level at which its evidence is greatest."""
-        out = []
-        for some in zip(*each, strict=True):
-            total = [level.base + p.nats for level, p in zip(self.levels, some, strict=True)]
-            i = int(np.argmax(total))
-            out.append(replace(some[i], nats=total[i] - self.base))
-        return out
+    def of(self, own: tuple[int, ...]) -> Promise:
+        """A set at the level at which its evidence is greatest."""
+        total, best = max(((level.base + (p := level.of(own)).nats, p) for level in self.levels), key=lambda x: x[0])
+        return replace(best, nats=total - self.base)
 
 
 def _scaled(hyper: Hyper, share: float) -> Hyper:
@@ -128,7 +72,12 @@ def _scaled(hyper: Hyper, share: float) -> Hyper:
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """Products with everything else integrated out: S `[P, P]`, g `[P]`, priors; base: evidence without columns."""
+    """Columns with all else integrated out: a fit's parameters, force and start states.
+
+    Attributes:
+        S, g: `[P, P]`, `[P]`, products with each other and with the residual; precision: `[P]`, of priors.
+        room: `[P, 2]`; base: evidence without columns.
+    """
 
     S: Array
     g: Array
@@ -143,6 +92,12 @@ class _Level:
         nats = float(g @ t - 0.5 * t @ H @ t + 0.5 * np.sum(np.log(P)) - 0.5 * np.linalg.slogdet(H)[1])
         return Promise(own, nats, t)
 
+    def singles(self) -> Array:
+        """`[P]`: of each column alone, within its bounds."""
+        d = np.diag(self.S) + self.precision
+        t = np.clip(self.g / d, *self.room.T)
+        return self.g * t - 0.5 * t**2 * d + 0.5 * np.log(self.precision / d)
+
     def pairs(self) -> Array:
         """`[P, P]`: of all pairs without bounds."""
         d = np.diag(self.S) + self.precision
@@ -154,79 +109,35 @@ class _Level:
         return np.where(determinant > 1e-6 * np.outer(d, d), found, -np.inf)
 
 
-def leading(part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column]) -> list[Column]:
-    """The columns that promise most by themselves, so many of each candidate (`Effort.points`); few products tell."""
-    g, s = _Rest(part, belief, _scaled(hyper, PRIORS.sizes[1]), columns, diagonal=True).projected()
+def _level(weighing: Weighing, fit: Fit, own: NDArray[np.int64], hyper: Hyper, columns: Sequence[Column]) -> _Level:
+    """The products in some windows `own`, as if those were typical of all."""
+    belief, k = belief_of(fit), 1 + len(fit.values)
+    Q, logdet = weighing.products(fit, hyper, np.stack([c.change for c in columns], 2), own)
+    share = len(fit.r) / len(own)
+    Q *= share
+    p = belief.best(Q[:k, :k])
+    free = np.flatnonzero((p > belief.low) & (p < belief.high))
+    H = Q[1:k, 1:k][np.ix_(free, free)] + np.diag(belief.precision[free])
+    across = Q[1:k, k:][free]
+    amplitude = (np.log(hyper.amplitude) - np.log(PRIORS.usual)) / PRIORS.spread
+    base = belief.cost(Q[:k, :k], p) + share * logdet + float(np.sum(amplitude**2)) + float(np.linalg.slogdet(H)[1])
+    g, S = Q[0, k:] - p @ Q[1:k, k:], Q[k:, k:] - across.T @ np.linalg.solve(H, across)
     precision = np.maximum([c.precision for c in columns], 1e-12)
-    t = np.clip(g / (s + precision), *np.array([c.room for c in columns]).T)
-    nats = g * t - 0.5 * t**2 * (s + precision) + 0.5 * np.log(precision / (s + precision))
-    count: dict[str, int] = {}
+    return _Level(S, g, precision, np.array([c.room for c in columns]), -0.5 * base)
+
+
+def leading(
+    weighing: Weighing, fit: Fit, own: NDArray[np.int64], hyper: Hyper, columns: Sequence[Column]
+) -> list[Column]:
+    """The columns that promise most by themselves, so many of each candidate (`Effort.points`)."""
+    hyper, count, nats = _scaled(hyper, PRIORS.sizes[1]), Counter[str](), list[float]()
+    for first in range(0, len(columns), EFFORT.windows):  # some at a time: products of all are large
+        nats += _level(weighing, fit, own, hyper, columns[first : first + EFFORT.windows]).singles().tolist()
     out = []
-    for j in np.argsort(-nats):
-        label = columns[j].candidate.label
-        count[label] = count.get(label, 0) + 1
-        out += [columns[j]] if count[label] <= EFFORT.points else []
+    for j in np.argsort(-np.array(nats)):
+        count[columns[j].candidate.label] += 1
+        out += [columns[j]] if count[columns[j].candidate.label] <= EFFORT.points else []
     return out
-
-
-class _Rest:
-    """Columns with all else integrated out: a fit's parameters, force and start states, in some windows."""
-
-    def __init__(
-        self, part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column], diagonal: bool = False
-    ) -> None:
-        self.part = part
-        nodes = part.D.shape[2] // len(part.scale)
-        self.root = np.kron(np.diag(hyper.amplitude * part.scale), correlation(nodes, hyper.memory))
-        self.noise = np.tile(hyper.noise, part.r.shape[1] // part.channels)
-        self.own = 1 + part.A.shape[2]
-        self.few, self.among = self.products(columns, diagonal)
-        few = self.few[:, : self.own]
-        self.p = belief.best(few)
-        self.free = np.flatnonzero((self.p > belief.low) & (self.p < belief.high))
-        self.H = few[1:, 1:][np.ix_(self.free, self.free)] + np.diag(belief.precision[self.free])
-        amplitude = (np.log(hyper.amplitude) - np.log(PRIORS.usual)) / PRIORS.spread
-        self.base = -0.5 * (belief.cost(few, self.p) + self.logdet + float(np.sum(amplitude**2)))
-        self.base -= 0.5 * float(np.linalg.slogdet(self.H)[1]) if len(self.free) else 0.0
-
-    def products(self, columns: Sequence[Column], diagonal: bool) -> tuple[Array, Array]:
-        """Inner products with force and start states integrated out, summed over the windows.
-
-        Returns:
-            Of (residual, parameters) with (residual, parameters, columns) `[1 + k, 1 + k + P]`, and of the columns with
-            each other `[P, P]`, or with themselves `[P]`.
-        """
-        part, own, logdet = self.part, self.own, 0.0
-        few = np.zeros((own, own + len(columns)))
-        among = np.zeros(len(columns) if diagonal else (len(columns), len(columns)))
-        for w in range(len(part.r)):
-            V = np.concatenate([part.D[w] @ self.root, part.B[w] * part.spread], 1) / self.noise[:, None]
-            L = np.linalg.cholesky(V.T @ V + np.eye(V.shape[1]))
-            start = part.r[w] + part.B[w] @ part.offsets[w]
-            Y = np.stack([start, *part.A[w].T, *(c.change[w] for c in columns)], 1) / self.noise[:, None]
-            T = np.linalg.solve(L, V.T @ Y)
-            few += Y[:, :own].T @ Y - T[:, :own].T @ T
-            Y, T = Y[:, own:], T[:, own:]
-            among += np.sum(Y**2, 0) - np.sum(T**2, 0) if diagonal else Y.T @ Y - T.T @ T
-            logdet += 2 * float(np.sum(np.log(np.diag(L))) + np.sum(np.log(self.noise)))
-        self.logdet = logdet * part.share
-        return few * part.share, among * part.share
-
-    def projected(self) -> tuple[Array, Array]:
-        """(gradients `[P]`, products `[P, P]` or `[P]`) with the parameters at their best for each amount."""
-        own, few, among = self.own, self.few, self.among
-        across = few[1:, own:][self.free]
-        take = np.linalg.solve(self.H, across) if len(self.free) else across
-        g = few[0, own:] - self.p @ few[1:, own:]
-        less = np.sum(across * take, 0) if among.ndim == 1 else across.T @ take
-        return g, among - less
-
-
-def _level(part: Part, belief: Belief, hyper: Hyper, columns: Sequence[Column]) -> _Level:
-    rest = _Rest(part, belief, hyper, columns)
-    g, S = rest.projected()
-    precision = np.maximum([c.precision for c in columns], 1e-12)
-    return _Level(S, g, precision, np.array([c.room for c in columns]), rest.base)
 
 
 @dataclass(frozen=True)
@@ -259,30 +170,18 @@ def around(weighing: Weighing, key: Key, say: Progress) -> list[Plan]:
     state, model = weighing.state, weighing.state.models[key]
     fit = state.begun(model.fit)
     others = [c for c in state.candidates if all(beside(c, e) for e in model.effects)]
-    known = state.secants.columns
-    columns = [Column(c, point, change) for c in others for point, change in known.get(c.label, ())]
+    columns = state.secants.of(others)
     if not columns:
         return []
-    (part, belief), hyper = _part(weighing, fit, state.secants.own), weighing.scored[key].learnt.hyper
-    columns = leading(part, belief, hyper, columns)
+    own, hyper = state.secants.own, weighing.scored[key].learnt.hyper
+    whole = weighing.doubts.beside(fit)
+    columns = leading(weighing, whole, own, hyper, columns)
     if key:
-        labels = list(dict.fromkeys(c.candidate.label for c in columns))[: EFFORT.candidates]
-        some = [c for c in others if c.label in labels]
-        plans = [(some.index(c.candidate), c.point) for c in columns if c.candidate.label in labels]
+        labels = list(dict.fromkeys(c.candidate.label for c in columns))[: EFFORT.batch]
+        plans = [(c.candidate, c.point) for c in columns if c.candidate.label in labels]
         own = looked_at(fit, state.settings.screened)
-        found = simulated(state.fitter, fit, some, plans, own, lambda _, done, total: say("second look", done, total))
-        columns = [Column(some[i], point, change) for i, point, change in found]
-        part, belief = _part(weighing, fit, own)
-    promises = Promises(part, belief, hyper, columns)
-    return _plans(weighing, key, promises)
-
-
-def _part(weighing: Weighing, fit: Fit, own: NDArray[np.int64]) -> tuple[Part, Belief]:
-    """Some windows of a fit, and the prior of its parameters."""
-    fit = weighing.doubted(fit)
-    arrays = fit.r[own], fit.A[own], weighing.D[own], fit.B[own], fit.offsets[own]
-    part = Part(*arrays, weighing.state.fitter.spread, weighing.scale, weighing.channels, len(fit.r) / len(own))
-    return part, belief_of(fit)
+        columns = [*simulated(state.fitter, fit, plans, own, lambda _, done, total: say("second look", done, total))]
+    return _plans(weighing, key, Promises(weighing, whole, own, hyper, columns))
 
 
 def _plans(weighing: Weighing, key: Key, promises: Promises) -> list[Plan]:
@@ -304,13 +203,13 @@ def _sets(promises: Promises, price: float) -> list[Promise]:
     """Single columns, pairs, and larger sets that grow from the best of these as long as each more pays its price."""
     columns, usable = promises.columns, range(len(promises.columns))
     blocked = np.array([[not beside(a.candidate, b.candidate) for b in columns] for a in columns])
-    found = {p.own: p for p in promises.of([(j,) for j in usable])}
+    found = {(j,): promises.of((j,)) for j in usable}
     found |= {p.own: p for p in promises.pairs(blocked, 2 * EFFORT.batch)}
     for seed in sorted(found.values(), key=lambda p: price * len(p.own) - p.nats)[: EFFORT.sets[1]]:
         grown = seed
         while len(grown.own) < len(EFFORT.sets):
             more = [tuple(sorted((*grown.own, j))) for j in usable if not blocked[j, list(grown.own)].any()]
-            top = max(promises.of(more), key=lambda p: p.nats, default=None)
+            top = max(map(promises.of, more), key=lambda p: p.nats, default=None)
             if top is None or top.nats < grown.nats + price:
                 break
             grown = found[top.own] = top

@@ -19,20 +19,18 @@ from bayessim_mjx.diagnosis.evidence.laws import (
     related,
     same_lateness,
     special_case,
+    stand_ins,
     with_same_inertia,
 )
-from bayessim_mjx.diagnosis.evidence.masked_effects import stand_ins
-from bayessim_mjx.diagnosis.evidence.promises import Column, Plan, around
-from bayessim_mjx.diagnosis.evidence.sets import Weighed
-from bayessim_mjx.diagnosis.evidence.weighing import Weighing
+from bayessim_mjx.diagnosis.evidence.promises import Plan, around
+from bayessim_mjx.diagnosis.evidence.weighing import Weighed, Weighing
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER, Progress
-from bayessim_mjx.diagnosis.selection.fits import cut_back, polish
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS
-from bayessim_mjx.diagnosis.selection.search_state import SearchState
+from bayessim_mjx.diagnosis.selection.search_state import SearchState, cut_back, polish
 from bayessim_mjx.diagnosis.selection.successive_halving import Entries, fit_entries
 
 Array = NDArray[np.float64]
@@ -100,13 +98,11 @@ class Search:
             if rest not in self.state.models:
                 continue
             for c in self.state.candidates:
-                points = self.state.secants.columns.get(c.label, ())
-                key = rest | {c.label}
+                columns, key = self.state.secants.of([c]), rest | {c.label}
                 alike = related(c, effect) or same_lateness(c, effect, self.state.fitter.simulator.physics.mj_model)
-                if points and alike and (self._first(best, key) if inertia(c, effect) else self._new(key)):
+                if columns and alike and (self._first(best, key) if inertia(c, effect) else self._new(key)):
                     starts, known = self._begun(model, effect, c)
-                    column = Column(c, *points[-1])
-                    out.append(Plan(key, np.inf, rest, (column,), (1.0,), starts, best, known))
+                    out.append(Plan(key, np.inf, rest, (columns[-1],), (1.0,), starts, best, known))
         return out
 
     def _first(self, best: Key, key: Key) -> bool:
@@ -178,10 +174,14 @@ class Search:
         at the parameter as it is, and may rest there.
         """
         key = self.weighing.weighed().answer
+        known = (model := self.state.models[key]).fit.values[: len(self.state.fitter.base)]
         plans = [
-            Plan(key | {s.candidate.label}, np.inf, key, (s.column,), (1.0,), (s.point,), key, (s.known,))
-            for s in sorted(stand_ins(self.state, self.state.models[key]), key=lambda s: -s.nats)[: EFFORT.sets[0]]
-        ]
+            Plan(
+                key | {s.column.candidate.label}, np.inf, key, (s.column,), (1.0,), (s.point,), key,
+                (known - s.steps[: len(known)],),
+            )
+            for s in sorted(stand_ins(self.state, model), key=lambda s: -s.nats)[: EFFORT.sets[0]]
+        ]  # fmt: skip
         if plans and not self.state.settings.budget.over(TOGETHER):
             self._fit(plans, "beside known parameters", TOGETHER)
 

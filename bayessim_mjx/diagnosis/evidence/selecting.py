@@ -10,25 +10,55 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.evidence import force_left, masked_effects
+from bayessim_mjx.diagnosis.evidence import force_left, laws
 from bayessim_mjx.diagnosis.evidence.force_left import ForceLeft
 from bayessim_mjx.diagnosis.evidence.laws import compatible, special_cases
-from bayessim_mjx.diagnosis.evidence.promises import Column
 from bayessim_mjx.diagnosis.evidence.search import Search
-from bayessim_mjx.diagnosis.evidence.sets import Weighed
-from bayessim_mjx.diagnosis.evidence.weighing import Estimated, Size, Weighing, at_its_mean, estimated, size_in
+from bayessim_mjx.diagnosis.evidence.weighing import Estimated, Scored, Weighed, Weighing, at_its_mean, estimated
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate, solve
 from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
-from bayessim_mjx.diagnosis.selection.fits import begin, cut_back
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model
-from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings
+from bayessim_mjx.diagnosis.selection.screen import Column
+from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings, begin, cut_back
 from bayessim_mjx.diagnosis.selection.successive_halving import Entries, fit_entries
 from bayessim_mjx.diagnosis.statistics import Gap, shapley
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large an effect is: the parameter that lies most standard deviations from neutral, and by how much.
+
+    Attributes:
+        quantity: the parameter's name; mean, sd: of its distance from neutral, in its unit.
+    """
+
+    quantity: str
+    mean: float
+    sd: float
+    unit: str
+
+
+def size_of(effect: Candidate, values: Array, sd: Array) -> Size:
+    """How large an effect with these numbers `[k]` and standard deviations `[k]` is; shapes are no sizes."""
+    each = zip(effect.coordinates, effect.shapes, values, sd, strict=True)
+    sizes = [
+        Size(c.name.rsplit(".", 1)[1], abs(float(v - c.neutral)), float(s), c.unit)
+        for c, shape, v, s in each
+        if not shape
+    ]
+    return max(sizes, key=lambda size: size.mean / max(size.sd, 1e-12))
+
+
+def size_in(of: Scored, effect: Candidate) -> Size:
+    """How large one of the model's effects is."""
+    mean, covariance = of.numbers()
+    own = [of.model.fit.names.index(c.name) for c in effect.coordinates]
+    return size_of(effect, mean[own], np.sqrt(np.diag(covariance)[own]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +95,8 @@ class Selection:
         promised: predicted share of the base model's gap that its effects close, {label: part}.
         chosen: {operating condition: effects that are named without it}.
         elsewhere: share of the gap closed on conditions that the choice was made without; NaN of one condition.
-        hidden: labels of effects that would not show beside those of the answer (`masked_effects.by_effects`).
-        stand_ins: {known parameter: labels of effects that it may stand for} (`masked_effects.by_parameters`).
+        hidden: labels of effects that would not show beside those of the answer (`laws.by_effects`).
+        stand_ins: {known parameter: labels of effects that it may stand for} (`laws.by_parameters`).
         weighed: probabilities of the sets that were fitted; estimated: posterior of the answer's numbers.
         force: what the answer leaves as force.
     """
@@ -120,8 +150,8 @@ def select(
         promised=promised(state, answer.effects) if answer.effects else (0.0, {}),
         chosen=chosen,
         elsewhere=_elsewhere(state, chosen),
-        hidden=masked_effects.by_effects(state, answer, say),
-        stand_ins=masked_effects.by_parameters(state, answer),
+        hidden=laws.by_effects(state, answer, say),
+        stand_ins=laws.by_parameters(state, answer),
         weighed=found,
         estimated=estimated(search.weighing, found),
         force=force_left.of_set(search.weighing, found.answer),
@@ -138,12 +168,12 @@ def _rival(weighing: Weighing, effect: Candidate, key: Key, found: Weighed) -> R
     state = weighing.state
     model, answer = state.models[key], state.models[found.answer]
     others = tuple(e for e in model.effects if e.label not in found.answer)
+    size = size_in(weighing.scored[key], others[0]) if len(others) == 1 else None
     contains = any(effect.effect in special_cases(o) and o.where == effect.where for o in others)
     same = any(o.effect == effect.effect and not compatible(o, effect) for o in others)
     closed = state.gap(model).closed
     nats = found.nats[found.answer] - found.nats[key]
     why = phrases.CONTAINS if contains else phrases.close_by(nats, state.gap(answer).closed - closed)
-    size = size_in(weighing.scored[key], others[0]) if len(others) == 1 else None
     return Rival(others, model, closed, why, contains or same, size)
 
 

@@ -1,27 +1,105 @@
-"""The evidence of fitted models, each with the missing force learnt anew, and the posterior of the answer's numbers."""
+"""The evidence of fitted models, the posterior over sets of effects, and that of the answer's numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from bayessim_mjx.diagnosis.evidence import doubts
 from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, Windows, learn, marginal, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import Integrated, Posterior, belief_of, integrated
-from bayessim_mjx.diagnosis.evidence.sets import Weighed, weighed
-from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.residual import disturbance
 from bayessim_mjx.diagnosis.selection import heldout
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, PRIORS, RELEVANCE
-from bayessim_mjx.diagnosis.selection.search_state import SearchState
+from bayessim_mjx.diagnosis.selection.screen import part
+from bayessim_mjx.diagnosis.selection.search_state import SearchState, log_prior
 from bayessim_mjx.diagnosis.statistics import Z90, mixture_quantiles
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """Posterior probabilities of the sets that were fitted, most likely first.
+
+    A set with irrelevant effects is no explanation of its own: it counts for the set without them (`core`). Known
+    parameters are averaged over the sets as they are, as an irrelevant effect may take a part of their values.
+
+    Attributes:
+        weight: {explanation: probability}; nats: {explanation: log of evidence and prior over those of the known
+            parameters alone}. numbers: {set: free numbers of its effects}.
+        sets: {set: probability}, every one by itself.
+    """
+
+    weight: Mapping[Key, float]
+    nats: Mapping[Key, float]
+    numbers: Mapping[Key, int]
+    sets: Mapping[Key, float]
+
+    @property
+    def answer(self) -> Key:
+        """Of the sets that are as likely as the most likely one (`Odds.mention`), that with the fewest numbers."""
+        return min(self._within(ODDS.mention), key=lambda k: (len(k), self.numbers[k], -self.weight[k], sorted(k)))
+
+    @property
+    def beside(self) -> list[Key]:
+        """The other sets that the evidence does not speak strongly against, most likely first."""
+        return [k for k in self._within(ODDS.strong) if k != self.answer]
+
+    @property
+    def possible(self) -> list[Key]:
+        """The sets by themselves that the evidence does not speak strongly against, and the answer."""
+        best = max(self.sets.values())
+        return list(dict.fromkeys([self.answer, *(k for k, w in self.sets.items() if w * ODDS.strong >= best)]))
+
+    def to_dicts(self) -> list[dict[str, Any]]:
+        """The sets with 99.9 % of the probability, and the known parameters alone, for JSON."""
+        kept, whole = [], 0.0
+        for key, weight in self.weight.items():
+            kept += [key] if whole < 0.999 or key == BASE else []
+            whole += weight
+        base = self.nats[BASE]
+        return [{"effects": sorted(k), "probability": self.weight[k], "nats": self.nats[k] - base} for k in kept]
+
+    def _within(self, odds: float) -> list[Key]:
+        best = max(self.weight.values())
+        return [k for k, w in self.weight.items() if w * odds >= best]
+
+
+def core(key: Key, excess: Mapping[Key, float]) -> Key:
+    """The smallest subset of a set that leaves no relevant part of the gap more than the set.
+
+    Args:
+        excess: {set: held-out squared error above the noise, in noise variances}, of all sets that were fitted.
+    """
+    limit = excess[key] + RELEVANCE.noise + RELEVANCE.share * max(excess[BASE], 0.0)
+    enough = [k for k in excess if k <= key and excess[k] <= limit]
+    return min(enough, key=lambda k: (len(k), excess[k], sorted(k)))
+
+
+def weighed(
+    evidence: Mapping[Key, float], excess: Mapping[Key, float], numbers: Mapping[Key, int], candidates: int
+) -> Weighed:
+    """The posterior; `evidence` and `excess` (see `core`) have the empty set, the known parameters alone."""
+    total = {k: e + log_prior(k, candidates) for k, e in evidence.items()}
+    own, of = {k: excess[k] for k in evidence}, dict[Key, list[float]]()
+    for key, nats in total.items():
+        of.setdefault(core(key, own), []).append(nats - total[BASE])
+    explained = {k: float(logsumexp(each)) for k, each in of.items()}
+    return Weighed(_shares(explained), dict(explained), numbers, _shares(total))
+
+
+def _shares(nats: Mapping[Key, float]) -> dict[Key, float]:
+    """Probabilities by their logs, the greatest first."""
+    whole = logsumexp(list(nats.values()))
+    return {k: float(np.exp(nats[k] - whole)) for k in sorted(nats, key=lambda k: (-nats[k], len(k), sorted(k)))}
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +110,19 @@ class Scored:
     fit: Fit
     learnt: Learnt
     found: Integrated
+
+    def numbers(self) -> tuple[Array, Array]:
+        """(mean `[k]`, covariance) of the model's numbers; of those at a bound no spread."""
+        free, k = np.flatnonzero(self.found.free), len(self.model.fit.values)
+        mean, covariance = np.asarray(self.fit.values + self.learnt.step), np.zeros((len(self.fit.values),) * 2)
+        mean[free] = self.found.posterior.middle
+        covariance[np.ix_(free, free)] = self.found.posterior.together()
+        return mean[:k], covariance[:k, :k]
+
+    def known(self, base: int) -> tuple[Array, Array]:
+        """(mean `[base]`, covariance) of the known parameters; none that rests at a bound is known without error."""
+        mean, covariance = self.numbers()
+        return mean[:base], covariance[:base, :base] + np.diag(self.found.beside[:base] ** 2)
 
 
 class Weighing:
@@ -49,50 +140,52 @@ class Weighing:
         self.D = disturbance.columns(fitter, state.base.fit, disturbance.default_nodes(fitter), self.scale)
         self.channels = int(fitter.used.sum())
         self.scored: dict[Key, Scored] = {}
-        self._doubts = doubts.found(fitter, self.D, state.base.fit.B)
+        self.doubts = doubts.found(fitter, self.D, state.base.fit.B)
         self.score([BASE])
 
-    def doubted(self, fit: Fit) -> Fit:
-        """With what simulators differ by as further numbers."""
-        return doubts.doubted(fit, self._doubts)
-
-    def windows(self, fit: Fit, r: Array) -> Windows:
-        """The linear model about a fit, of residuals `[W, n]` at its values."""
+    def windows(self, fit: Fit, own: NDArray[np.int64] | slice = slice(None)) -> Windows:
+        """The linear model about a fit to the windows `own`."""
         spread = self.state.fitter.spread
-        return windows_of(r, fit.A, fit.B, self.D, fit.offsets, spread, self.scale, self.channels)
+        return windows_of(fit.r, fit.A, fit.B, self.D[own], fit.offsets, spread, self.scale, self.channels)
+
+    def products(self, fit: Fit, hyper: Hyper, more: Array, own: NDArray[np.int64]) -> tuple[Array, float]:
+        """`Marginal.Q` of (r, A, more `[w, n, c]`), and the log determinant, summed over the windows `own`."""
+        Q, logdet = np.zeros((1 + len(fit.values) + more.shape[2],) * 2), 0.0
+        for i, window in enumerate(own[:, None]):  # one by one: their products are large
+            some = part(fit, window)
+            some = replace(some, A=np.concatenate([some.A, more[i : i + 1]], 2))
+            there = marginal(self.windows(some, window), hyper)
+            Q, logdet = Q + there.Q[0], logdet + float(there.logdet[0])
+        return Q, logdet
 
     def score(self, keys: Iterable[Key]) -> None:
         """Compute the evidence of fitted models, again where the fit has changed."""
         for key in keys:
             model, old = self.state.models.get(key), self.scored.get(key)
             if model is not None and (old is None or old.model is not model):
-                fit = self.doubted(model.fit)
-                own = self.windows(fit, fit.r)
-                learnt = learn(own, belief_of(fit), self._alike())
-                self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt, _numbers(model)))
+                fit, like, numbers = self.doubts.beside(model.fit), self._alike(), _numbers(model)
+                windows = self.windows(fit)
+                learnt = learn(windows, belief_of(fit), like)
+                self.scored[key] = Scored(model, fit, learnt, integrated(fit, learnt, numbers))
 
     def _alike(self) -> list[Hyper]:
         """Hyperparameters to begin at: of the known parameters alone, and of the likeliest set."""
         some = {BASE: 0, self._best(): 0} if self.scored else {}
         return [self.scored[k].learnt.hyper for k in some]
 
-    def excess(self, key: Key) -> float:
-        """Held-out squared error above the likeliest set's noise, in noise variances as estimated from the logs."""
-        return self._error(key) - self._floor()
-
-    def _error(self, key: Key) -> float:
-        model = self.scored[key].model
-        return model.total / (self.state.noise * len(model.cost))
-
-    def _floor(self) -> float:
-        return float(np.mean(self.scored[self._best()].learnt.hyper.noise ** 2))
+    def excess(self, keys: Iterable[Key]) -> dict[Key, float]:
+        """Held-out squared errors above the likeliest set's noise, in noise variances as estimated from the logs."""
+        floor = float(np.mean(self.scored[self._best()].learnt.hyper.noise ** 2))
+        models = {k: self.scored[k].model for k in keys}
+        return {k: m.total / (self.state.noise * len(m.cost)) - floor for k, m in models.items()}
 
     def _best(self) -> Key:
         return max(self.scored, key=self.total)
 
     def settled(self, key: Key) -> bool:
         """Whether a set of effects leaves nothing that matters."""
-        return bool(key) and self.excess(key) <= RELEVANCE.noise + RELEVANCE.share * max(self.excess(BASE), 0.0)
+        left = self.excess([key, BASE])
+        return bool(key) and left[key] <= RELEVANCE.noise + RELEVANCE.share * max(left[BASE], 0.0)
 
     def total(self, key: Key) -> float:
         """Log of evidence and prior over those of the known parameters alone."""
@@ -109,17 +202,15 @@ class Weighing:
         return self._weighed({k: _without(s, kept) for k, s in self.scored.items()})
 
     def _weighed(self, nats: dict[Key, float]) -> Weighed:
-        floor = self._floor()
-        excess = {k: self._error(k) - floor for k in self.scored}
         numbers = {k: sum(len(e.coordinates) for e in s.model.effects) for k, s in self.scored.items()}
-        return weighed(nats, excess, numbers, len(self.state.candidates))
+        return weighed(nats, self.excess(self.scored), numbers, len(self.state.candidates))
 
 
 def _without(of: Scored, kept: NDArray[np.bool_]) -> float:
     """Evidence given some of the windows alone, with the same hyperparameters."""
     there = of.learnt.marginal
-    part = replace(there, Q=there.Q[kept], logdet=there.logdet[kept], cov=there.cov[kept], mean=there.mean[kept])
-    learnt = replace(of.learnt, marginal=part, step=belief_of(of.fit).best(part.Q.sum(0)))
+    some = replace(there, Q=there.Q[kept], logdet=there.logdet[kept], cov=there.cov[kept], mean=there.mean[kept])
+    learnt = replace(of.learnt, marginal=some, step=belief_of(of.fit).best(some.Q.sum(0)))
     return integrated(of.fit, learnt, _numbers(of.model)).nats
 
 
@@ -141,36 +232,11 @@ class Estimated:
         step: most probable step `[k]` from the answer's fit, of residuals `[W, n]` at its values.
     """
 
-    mean: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    mean: Array
+    covariance: Array
     sheet: Posterior
-    noise: NDArray[np.float64]
-    step: Callable[[NDArray[np.float64]], NDArray[np.float64]]
-
-
-@dataclass(frozen=True)
-class Size:
-    """How large an effect is: the parameter that lies most standard deviations from neutral, and by how much.
-
-    Attributes:
-        quantity: the parameter's name; mean, sd: of its distance from neutral, in its unit.
-    """
-
-    quantity: str
-    mean: float
-    sd: float
-    unit: str
-
-
-def size_of(effect: Candidate, values: Array, sd: Array) -> Size:
-    """How large an effect with these numbers `[k]` and standard deviations `[k]` is; shapes are no sizes."""
-    each = zip(effect.coordinates, effect.shapes, values, sd, strict=True)
-    sizes = [
-        Size(c.name.rsplit(".", 1)[1], abs(float(v - c.neutral)), float(s), c.unit)
-        for c, shape, v, s in each
-        if not shape
-    ]
-    return max(sizes, key=lambda size: size.mean / max(size.sd, 1e-12))
+    noise: Array
+    step: Callable[[Array], Array]
 
 
 def at_its_mean(weighing: Weighing, key: Key) -> Model:
@@ -182,10 +248,10 @@ def at_its_mean(weighing: Weighing, key: Key) -> Model:
     low, high = (np.array([getattr(c, end) for c in old.model.fit.coordinates]) for end in ("low", "high"))
     for _ in range(EFFORT.rounds):
         here = weighing.scored[key]
-        mean, covariance = _own(here)
+        mean, covariance = here.numbers()
         mean = np.clip(mean, low, high)
         # a move by d standard deviations changes the log density by d^2 / 2 nats
-        if np.all((mean - here.model.fit.values) ** 2 <= 2 * EFFORT.tolerance * np.diag(covariance)):
+        if np.all((mean - here.model.fit.values) ** 2 <= 2 * RELEVANCE.share * np.diag(covariance)):
             break
         moved = fitter.refresh(replace(here.model.fit, values=mean, history=()))
         state.models[key] = scored(fitter, moved, old.model.effects)
@@ -193,8 +259,7 @@ def at_its_mean(weighing: Weighing, key: Key) -> Model:
     else:
         if weighing.scored[key].found.nats < old.found.nats - np.log(ODDS.mention):
             state.models[key], weighing.scored[key] = old.model, old
-    (model,) = heldout.refitted(fitter, [state.models[key]])
-    state.models[key] = model
+    state.models[key] = model = heldout.refitted(fitter, state.models[key])
     weighing.scored[key] = replace(weighing.scored[key], model=model)
     return model
 
@@ -202,37 +267,37 @@ def at_its_mean(weighing: Weighing, key: Key) -> Model:
 def estimated(weighing: Weighing, found: Weighed) -> Estimated:
     """Of the answer's numbers; known parameters with all sets that are possible, by their probabilities."""
     answer, base = weighing.scored[found.answer], len(weighing.state.fitter.base)
-    mean, covariance = _own(answer)
-    covariance[:base, :base] += _beside(answer, base)
-    keys = found.possible
-    share = np.array([found.sets[k] for k in keys])
-    share /= share.sum()
-    each = [_known(weighing.scored[key], base) for key in keys]
-    away, spread = (np.array(x) for x in zip(*((m - mean[:base], s) for m, s in each), strict=True))
+    mean, covariance = answer.numbers()
+    covariance[:base, :base] = answer.known(base)[1]
     sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    share = np.array([found.sets[k] for k in found.possible])
+    each = [weighing.scored[key].known(base) for key in found.possible]
+    away = np.array([m - mean[:base] for m, _ in each])
+    spread = np.sqrt(np.maximum([np.diag(c) for _, c in each], 1e-300))
     wider = np.ones(len(sd))
-    wider[:base] = np.maximum(_spread(share, away, spread) / sd[:base], 1.0)
+    wider[:base] = np.maximum(_spread(share / share.sum(), away, spread) / sd[:base], 1.0)
     covariance = covariance * wider[:, None] * wider
-    away = np.where(
-        np.arange(len(sd)) < base, 0.0, mean - answer.model.fit.values
-    )  # effects' numbers are those of the fit
-    covariance = covariance + np.diag(away**2)
+    moved = mean - answer.model.fit.values  # effects' numbers are those of the fit
+    moved[:base] = 0.0
+    covariance = covariance + np.diag(moved**2)
 
     def step(r: Array) -> Array:
-        there = marginal(weighing.windows(answer.fit, r), answer.learnt.hyper)
+        there = marginal(weighing.windows(replace(answer.fit, r=r)), answer.learnt.hyper)
         return belief_of(answer.fit).best(there.Q.sum(0))[: len(answer.model.fit.values)]
 
     above = np.maximum(answer.learnt.hyper.amplitude**2 - PRIORS.least**2, 0.0)  # less is there for any law
     size = weighing.scale * np.sqrt(above)
-    covariance = covariance + doubts.covariance(weighing.state.fitter, weighing.D, size, step, answer.fit.r)
+    covariance = covariance + _taken(weighing, answer, doubts.common(weighing.state.fitter, weighing.D, size))
     return Estimated(mean, covariance, answer.found.posterior, answer.learnt.hyper.noise, step)
 
 
-def _known(of: Scored, base: int) -> tuple[Array, Array]:
-    """(means, standard deviations) `[base]` of the known parameters in one set."""
-    mean, covariance = _own(of)
-    covariance = covariance[:base, :base] + _beside(of, base)
-    return mean[:base], np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+def _taken(weighing: Weighing, of: Scored, columns: Array) -> Array:
+    """`[k, k]`, of a model's numbers that take errors with columns `[W, n, c]`, each of standard deviation 1."""
+    k, free = len(of.fit.values), np.flatnonzero(of.found.free)
+    Q, _ = weighing.products(of.fit, of.learnt.hyper, columns, np.arange(len(of.fit.r)))
+    H, moves = Q[1 : 1 + k, 1 : 1 + k] + np.diag(belief_of(of.fit).precision), np.zeros((k, columns.shape[2]))
+    moves[free] = np.linalg.solve(H[np.ix_(free, free)], Q[1 : 1 + k, 1 + k :][free])
+    return np.asarray(moves @ moves.T)[: len(of.model.fit.values), : len(of.model.fit.values)]
 
 
 def _spread(share: Array, away: Array, sd: Array) -> Array:
@@ -246,25 +311,3 @@ def _spread(share: Array, away: Array, sd: Array) -> Array:
     both = np.concatenate([away, -away])  # the distance from 0 is within what this mixture holds up to 95 %
     half = mixture_quantiles(np.tile(share / 2, 2), both, np.tile(sd, (2, 1)), (0.95,))[0]
     return np.asarray(np.maximum(np.sqrt(share @ (sd**2 + away**2)), half / Z90))
-
-
-def size_in(of: Scored, effect: Candidate) -> Size:
-    """How large one of the model's effects is."""
-    mean, covariance = _own(of)
-    own = [of.model.fit.names.index(c.name) for c in effect.coordinates]
-    return size_of(effect, mean[own], np.sqrt(np.diag(covariance)[own]))
-
-
-def _beside(of: Scored, base: int) -> Array:
-    """Covariance `[base, base]` of the known parameters that rest at a bound: none of them is known without error."""
-    return np.diag(of.found.beside[:base] ** 2)
-
-
-def _own(of: Scored) -> tuple[Array, Array]:
-    """(mean `[k]`, covariance) of the model's numbers; of those at a bound no spread."""
-    posterior, free = of.found.posterior, np.flatnonzero(of.found.free)
-    mean, covariance = np.asarray(of.fit.values + of.learnt.step), np.zeros((len(of.fit.values),) * 2)
-    mean[free] = posterior.middle
-    covariance[np.ix_(free, free)] = posterior.together()
-    k = len(of.model.fit.values)
-    return mean[:k], covariance[:k, :k]

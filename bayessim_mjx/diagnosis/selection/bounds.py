@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -11,10 +12,9 @@ import numpy as np
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
-from bayessim_mjx.diagnosis.selection.fits import AFRESH
 from bayessim_mjx.diagnosis.selection.models import Model, nats, scored
 from bayessim_mjx.diagnosis.selection.numbers import ODDS, PRIORS
-from bayessim_mjx.diagnosis.selection.search_state import SearchState
+from bayessim_mjx.diagnosis.selection.search_state import AFRESH, SearchState
 from bayessim_mjx.physics import Physics
 
 SINGLE = float(np.finfo(np.float32).eps)  # values are written into the model in single precision
@@ -44,19 +44,16 @@ def widened(state: SearchState, model: Model, say: Progress) -> Model:
     means that the effect is off, where physics ends, and where it sizes an effect's memory.
     """
     last = model
-    while not state.settings.budget.over(LEAVING_OUT) and _held(state, last) and _promised(state, last):
+    while not state.settings.budget.over(LEAVING_OUT) and _held(state, last):
+        left = max(last.total - promise(state, last), 1e-9)
+        if 0.5 * last.samples * math.log(last.total / left) <= math.log(ODDS.strong):
+            break
         say("wider ranges", 0, 1)
         last = _refitted(state, last, _moved(state, last, _grown))
         if nats(model, last) >= math.log(ODDS.strong):
             _adopt(state, last)
             model = last
     return model
-
-
-def _promised(state: SearchState, model: Model) -> bool:
-    """Whether the held-out evidence that ranges as wide as they may get promise is worth a refit."""
-    left = max(model.total - promise(state, model), 1e-9)
-    return 0.5 * model.samples * math.log(model.total / left) > math.log(ODDS.strong)
 
 
 def promise(state: SearchState, model: Model) -> float:
@@ -66,7 +63,7 @@ def promise(state: SearchState, model: Model) -> float:
     g, S = q.weighted(fit.weight)
     precision, pull, low, high = fit.prior()
     S, g = S + np.diag(precision), g + pull
-    far = {c.name: c for e in _moved(state, model, _freed) for c in e.coordinates}
+    far = {c.name: c for e in _moved(state, model, functools.partial(_grown, whole=True)) for c in e.coordinates}
     wide = [far.get(c.name, c) for c in fit.coordinates]
     ends = [np.array([getattr(c, end) for c in wide]) - fit.values for end in ("low", "high")]
     near, free = solve(S, g, low, high), solve(S, g, *ends)
@@ -126,21 +123,15 @@ def _held(state: SearchState, model: Model) -> bool:
     return any(new is not old for new, old in zip(_moved(state, model, _grown), model.effects, strict=True))
 
 
-def _freed(physics: Physics, c: Coordinate, value: float) -> Coordinate:
-    """As wide as it may get, where the value is at an end that may move."""
-    if _grown(physics, c, value) is c:
-        return c
-    far = _farthest(physics, c, end := _end(c, value))
-    return replace(c, high=far) if end == "high" else replace(c, low=far)
-
-
-def _grown(physics: Physics, c: Coordinate, value: float) -> Coordinate:
+def _grown(physics: Physics, c: Coordinate, value: float, whole: bool = False) -> Coordinate:
+    """Twice as wide, or as wide as it may get (`whole`), where the value is at an end that may move."""
     end = _end(c, value)
-    if not end or getattr(c, end) == _farthest(physics, c, end):
+    if not end or getattr(c, end) == (far := _farthest(physics, c, end)):
         return c
     if c.neutral == getattr(c, end) and not physics.quantity(c.index[0]).shape:
         return c
-    far = _farthest(physics, c, end)
+    if whole:
+        return replace(c, **{end: far})
     if end == "high":
         wider = replace(c, high=min(far, c.neutral + 2 * (c.high - c.neutral)))
     else:

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES as HELD_OUT
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import Gap
 
 Array = NDArray[np.float64]
-
-
-GRID = 1000  # shares at which an interval is looked for, dense near 1: 16 decades of float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,47 +39,31 @@ class Prediction:
 
 def predict(fitter: Fitter, model: Model) -> Prediction:
     """Simulate each condition's windows with the parameters found without it; starts re-estimated on the window."""
-    return predictions(fitter, [model])[0]
-
-
-def predictions(fitter: Fitter, models: Sequence[Model]) -> list[Prediction]:
-    """`predict` of several models, simulated together."""
     _, fold = np.unique(fitter.simulator.windows.group, return_inverse=True)
-    thetas = [[fitter.vector(m.fit.coordinates, values) for values in m.estimates] for m in models]
-    return _settled(fitter, [m.fit for m in models], np.array(thetas), fold)
+    thetas = [fitter.vector(model.fit.coordinates, values) for values in model.estimates]
+    return _settled(fitter, model.fit, np.array(thetas), fold)
 
 
-def costs(fitter: Fitter, model: Model, seen: Prediction) -> Array:
-    """Costs `[W]` of a prediction with the uncertainty of what it was made with, in the units of `Model.cost`."""
-    fit, steps = model.fit, fitter.simulator.windows.steps
-    plain = seen.cost(steps) * fitter.size + np.sum((seen.offsets / fitter.spread) ** 2, axis=1)
-    q, _ = eliminate(seen.error.reshape(len(plain), -1), fit.A, fit.B, seen.offsets, fitter.spread)
-    return fitter.innovations(fit, np.zeros_like(model.estimates), model.estimates, plain, at=q)
-
-
-def refitted(fitter: Fitter, models: Sequence[Model]) -> list[Model]:
-    """The models with estimates without each condition that come of fits without it, all in lockstep.
+def refitted(fitter: Fitter, model: Model) -> Model:
+    """Take estimates without each condition that come of fits without it, all in lockstep.
 
     In the search one linear step from the common fit stands for such a fit: good enough to rank by, but where numbers
     are hardly told (a wind's sideways force) it can lead where the model is no longer linear. A condition that alone
     tells a parameter is held out in parts (`Fitter.scores`): its linear steps stay.
     """
-    group = fitter.simulator.windows.group
-    names = np.unique(group)
-    alone = [fitter.told_alone(m.fit) for m in models]
-    plans = [(i, g) for i in range(len(models)) for g in range(len(names)) if not alone[i][g]]
-    folds = [_Fold(fitter, models[i], group != names[g]) for i, g in plans]
+    group, estimates = fitter.simulator.windows.group, model.estimates.copy()
+    alone = zip(np.unique(group), fitter.told_alone(model.fit), strict=True)
+    folds = {g: _Fold(fitter, model, group != name) for g, (name, told) in enumerate(alone) if not told}
     for _ in range(EFFORT.rounds):
-        if not (running := [fold for fold in folds if not fold.rests]):
+        if not (running := [fold for fold in folds.values() if not fold.rests]):
             break
         thetas = np.stack([fitter.vector(fold.fit.coordinates, fold.values) for fold in running])
         seen = fitter.whiten(fitter.simulator.run(thetas, np.stack([fold.offsets for fold in running])))
         for fold, r in zip(running, seen, strict=True):
             fold.go_on(r)
-    estimates = [m.estimates.copy() for m in models]
-    for (i, g), fold in zip(plans, folds, strict=True):
-        estimates[i][g] = fold.found
-    return [replace(m, estimates=e) for m, e in zip(models, estimates, strict=True)]
+    for g, fold in folds.items():
+        estimates[g] = fold.found
+    return replace(model, estimates=estimates)
 
 
 class _Fold:
@@ -99,7 +80,7 @@ class _Fold:
         self.fitter, self.fit = fitter, replace(fit, weight=fit.weight * kept)
         cost = fitter.cost(self.fit, fit.r, fit.offsets, fit.values)
         nat = 2 * cost / (model.samples * kept.mean())
-        self.limit, self.worth = cost + nat * math.log(ODDS.strong), nat * EFFORT.tolerance
+        self.limit, self.worth = cost + nat * math.log(ODDS.strong), nat * RELEVANCE.share
         self.found = fit.values
         self.values, self.offsets = self._step(fit.values, fit.offsets, fit.r)
 
@@ -145,32 +126,25 @@ def noise_floor(fitter: Fitter, fit: Fit, noise: Array) -> Array:
 def nominal(fitter: Fitter, fit: Fit) -> Prediction:
     """The simulator as delivered, starts estimated."""
     theta = fitter.vector(fit.coordinates, np.array([c.neutral for c in fit.coordinates]))
-    return _settled(fitter, [fit], theta[None, None], np.zeros(len(fit.r), int))[0]
+    return _settled(fitter, fit, theta[None], np.zeros(len(fit.r), int))
 
 
-def _settled(fitter: Fitter, fits: Sequence[Fit], thetas: Array, of_theta: NDArray[np.int64]) -> list[Prediction]:
-    """All windows after two Newton steps of their start states.
-
-    thetas: `[fits, g, P]`; of_theta: `[W]`, which of a fit's thetas is a window's.
-    """
-    count, windows = len(fits), len(of_theta)
-    own = (np.arange(count)[:, None] * thetas.shape[1] + of_theta).ravel(), np.tile(np.arange(windows), count)
-    B = np.concatenate([fit.B for fit in fits])
+def _settled(fitter: Fitter, fit: Fit, thetas: Array, of_theta: NDArray[np.int64]) -> Prediction:
+    """All windows after two Newton steps of their start states; thetas: `[g, P]`; of_theta: `[W]`, a window's."""
+    own = of_theta, np.arange(len(of_theta))
 
     def simulated(offsets: Array) -> Array:
-        return fitter.whiten(fitter.simulator.run_each(thetas.reshape(-1, thetas.shape[2]), *own, offsets))
+        return fitter.whiten(fitter.simulator.run_each(thetas, *own, offsets))
 
-    offsets = np.concatenate([fit.offsets for fit in fits])
+    offsets, none = fit.offsets, np.zeros((*fit.r.shape, 0))
     r = simulated(offsets)
-    none = np.zeros((*r.shape, 0))
     for _ in range(2):
-        _, starts = eliminate(r, none, B, offsets, fitter.spread)
+        _, starts = eliminate(r, none, fit.B, offsets, fitter.spread)
         moved = offsets + starts.step(none, np.zeros(0))
         new = simulated(moved)
         better = (np.sum(new**2, 1) < np.sum(r**2, 1))[:, None]
         r, offsets = np.where(better, new, r), np.where(better, moved, offsets)
-    errors = r.reshape(count, windows, fitter.simulator.windows.steps, -1)
-    return [Prediction(*pair) for pair in zip(errors, np.split(offsets, count), strict=True)]
+    return Prediction(r.reshape(len(r), fitter.simulator.windows.steps, -1), offsets)
 
 
 def stages(costs: dict[str, Array], group: NDArray[np.int64]) -> dict[str, Any]:
@@ -227,25 +201,27 @@ class Closed:
         logarithm, and near 0 alike. As many conditions count as rule the one or the other, whichever are fewer. What
         undercuts the noise shows by how much the noise was taken for too large: that error of the floor counts too.
         """
-        rows = statistics.leave_one_out(self.group)
-        every, value = np.ones((1, len(self.before))), self.value
+        rows, value = statistics.leave_one_out(self.group), self.value
         if len(rows) < 2 or math.isnan(value):
             return statistics.NOTHING
-        _, _, noise = (float(x[0]) for x in self._sums(every))
-        far_off = np.geomspace(2.0, np.finfo(np.float64).eps, GRID)
-        near = (1.0 - value) * (1.0 + np.concatenate([-far_off, far_off]) / 2)  # where errors are small
-        shares = np.clip(1.0 - np.sort(np.concatenate([far_off, near, [0.0]]))[::-1], -1.0, 1.0)[:, None]
+        (before, left, noise), without = self._sums(np.ones(len(self.before))), self._sums(rows)
         off = max(1.0 - float(self.after.sum()) / noise, 0.0)  # of the floor
+        left, left_without = (np.maximum(x, 1e-9) for x in (left, without[1]))
 
-        def both(rows: Array) -> tuple[Array, Array]:
-            before, left, noise = self._sums(rows)
-            return np.maximum(left, 1e-9), np.maximum((1 - shares) * before + shares * noise, 1e-9)
+        def beyond(share: float) -> float:
+            """How much farther off 0 the logarithm is than is allowed."""
+            said, said_without = (
+                np.maximum((1 - share) * b + share * n, 1e-9) for b, n in ((before, noise), without[::2])
+            )
+            counting = (np.maximum(x - y, 0.0) for x, y in ((left, left_without), (said, said_without)))
+            freedom = min(float(statistics.freedom(own, statistics.RULED)) for own in counting)
+            error = float(statistics.error(np.log(left_without / said_without)))
+            allowed = float(statistics.quantile(freedom)) * math.hypot(error, off * share * noise / said)
+            return abs(math.log(left / said)) - allowed
 
-        (left, said), (left_without, said_without) = both(every), both(rows)
-        counting = [np.maximum(left - left_without, 0.0)[:, None], np.maximum(said - said_without, 0.0).T]
-        freedom = np.minimum(*(statistics.freedom(own, statistics.RULED) for own in counting))
-        error = statistics.error(np.log(left_without / said_without).T)
-        allowed = statistics.quantile(freedom) * np.hypot(error, off * shares[:, 0] * noise / said[:, 0])
-        far = np.log(left / said)
-        kept = shares[:, 0][np.abs(far[:, 0]) <= allowed]
-        return float(min([*kept[:1], value])), float(max([*kept[-1:], value]))
+        def end(farthest: float) -> float:
+            if beyond(value) > 0.0 or beyond(farthest) <= 0.0:
+                return value if beyond(value) > 0.0 else farthest
+            return float(brentq(beyond, value, farthest, xtol=np.finfo(np.float64).eps))
+
+        return end(-1.0) if value > -1.0 else value, end(1.0)

@@ -51,7 +51,8 @@ class Relevance:
     """How much an effect has to change to be relevant, however significant (docs/decisions/relevance_and_odds.md).
 
     Attributes:
-        share: of the squared gap that the known parameters leave; laws of two simulators differ by as much.
+        share: of the squared gap that the known parameters leave; laws of two simulators differ by as much. Also of a
+            fit's cost, that a step has to gain.
         noise: noise variances, which are added; less does not show in the motion.
     """
 
@@ -82,8 +83,7 @@ class Effort:
         rounds: of whatever is repeated until it gains nothing, at most.
         margin: nats below the leading set, within which a promised set is fitted.
         windows: that screening simulates. Half of them rank starts, where there are as many.
-        points: starting points of a candidate that a look at a set simulates.
-        steps: of a fit at most; tolerance: share of its cost that a step has to gain, and nats close to its end.
+        steps: of a fit at most; it ends before where a step gains an irrelevant share of its cost (`Relevance.share`).
         close: times the best cost, up to which a fit on some windows goes on.
     """
 
@@ -91,20 +91,18 @@ class Effort:
     rounds: int = 5
     margin: float = 30.0
     windows: int = 48
-    points: int = 3
     steps: int = 12
-    tolerance: float = 5e-3
     close: float = 4.0
 
     @property
     def batch(self) -> int:
-        """Models that are fitted in lockstep; the state is kept after each batch."""
+        """Models that are fitted in lockstep, candidates that a look at a set simulates."""
         return sum(self.sets)
 
     @property
-    def candidates(self) -> int:
-        """Candidates that a look at a set simulates: as many starting points as windows."""
-        return self.windows // self.points
+    def points(self) -> int:
+        """Starting points of each of these candidates: as many in all as windows."""
+        return self.windows // self.batch
 
 
 PRIORS, RELEVANCE, ODDS, EFFORT = Priors(), Relevance(), Odds(), Effort()

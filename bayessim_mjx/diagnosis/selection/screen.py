@@ -93,28 +93,57 @@ class Projection:
 
     def taken(self, a: Array, share: float) -> Array | None:
         """Steps `[k]` of the fit's numbers that do the work of a column `[W, n]`; None where they do less of it."""
-        w = self.fit.weight
-        MBa = times(self.starts.M, times(self.Bt, a))
-        s_ab = self.weighted.T @ a.ravel()
-        along = self.inverse @ s_ab
-        s_aa = float(w @ (np.sum(a * a, 1) - np.sum(times(self.Bt, a) * MBa, 1)))
-        if s_aa <= 0 or float(s_ab @ along) <= share * s_aa:
+        s, _, s_aa, _ = self.moments(a)
+        if s_aa <= 0 or s_aa - s <= share * s_aa:
             return None
         steps = np.zeros(self.fit.A.shape[2])
-        steps[self.free] = along
+        steps[self.free] = self.inverse @ (self.weighted.T @ a.ravel())
         return steps
 
 
-def room(candidate: Candidate, way: Array) -> tuple[float, float]:
-    neutral = np.array([c.neutral for c in candidate.coordinates])
-    low, high = (np.array([getattr(c, e) for c in candidate.coordinates]) for e in ("low", "high"))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ahead = np.where(way > 0, (high - neutral) / way, np.where(way < 0, (low - neutral) / way, np.inf))
-        behind = np.where(way > 0, (neutral - low) / way, np.where(way < 0, (neutral - high) / way, np.inf))
-    return -float(np.min(behind)), float(np.min(ahead))
+@dataclass(frozen=True, eq=False)
+class Column:
+    """What one candidate does at one point.
+
+    Attributes:
+        candidate; point: `[k]`, where it was simulated; change: `[w, n]` of the residual.
+    """
+
+    candidate: Candidate
+    point: Array
+    change: Array
+
+    @property
+    def way(self) -> Array:
+        """`[k]` from neutral to the point; 0 for shapes."""
+        return np.where(self.candidate.shapes, 0.0, self.point - self._ends()[2])
+
+    @property
+    def room(self) -> tuple[float, float]:
+        """Least and greatest multiple of the way within the ranges."""
+        low, high, neutral = self._ends()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = np.stack([low - neutral, high - neutral]) / self.way
+        ends[:, self.way == 0] = [[-np.inf], [np.inf]]
+        return float(np.max(np.min(ends, 0))), float(np.min(np.max(ends, 0)))
+
+    @property
+    def precision(self) -> float:
+        """Of the multiple of the way, by the priors of the candidate's numbers."""
+        return float(sum(c.precision * w**2 for c, w in zip(self.candidate.coordinates, self.way, strict=True)))
+
+    def at(self, amount: float) -> Array:
+        """The point so many ways from neutral, within the ranges, and not at neutral, where many laws have no slope."""
+        low, high, neutral = self._ends()
+        amount = amount if abs(amount) > 0.02 else 0.02
+        return np.clip(np.where(self.candidate.shapes, self.point, neutral + amount * self.way), low, high)
+
+    def _ends(self) -> Array:
+        """`[3, k]`: low, high, neutral of the candidate's numbers."""
+        return np.array([[c.low, c.high, c.neutral] for c in self.candidate.coordinates]).T
 
 
-Plan = tuple[int, Array]  # candidate, starting point
+Plan = tuple[Candidate, Array]  # and a starting point
 
 
 @dataclass(eq=False)
@@ -126,11 +155,15 @@ class Secants:
     the first three in all; each of two effects was among the first eight.
 
     Attributes:
-        own: `[w]` the windows; columns: {candidate's label: [(point `[k]`, change of the residual `[w, n]`)]}.
+        own: `[w]` the windows; columns: {candidate's label: those of its points}.
     """
 
     own: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, int))
-    columns: dict[str, list[tuple[Array, Array]]] = field(default_factory=dict)
+    columns: dict[str, list[Column]] = field(default_factory=dict)
+
+    def of(self, candidates: Iterable[Candidate]) -> list[Column]:
+        """The columns of some candidates, in ranges as wide as they are by now."""
+        return [replace(own, candidate=c) for c in candidates for own in self.columns.get(c.label, ())]
 
 
 def screen(
@@ -142,7 +175,7 @@ def screen(
     secants: Secants | None = None,
     over: Callable[[], bool] | None = None,
 ) -> list[Screened]:
-    """All candidates on top of `fit`, best first, on at most `limit` windows.
+    """Rank all candidates on top of `fit`, best first, on at most `limit` windows.
 
     Gains are scaled to all windows as if those looked at were typical: good for ranking, too high as an estimate.
 
@@ -152,30 +185,14 @@ def screen(
     """
     secants = Secants() if secants is None else secants
     if not secants.columns:
-        _fill(secants, fitter, fit, candidates, limit, say, over)
-    return _ordered(projected(fitter, fit, candidates, secants))
-
-
-def _fill(
-    secants: Secants,
-    fitter: Fitter,
-    fit: Fit,
-    candidates: Sequence[Candidate],
-    windows: int,
-    say: Progress,
-    over: Callable[[], bool] | None,
-) -> None:
-    secants.own = looked_at(fit, windows)
-    plans = [(i, point) for i, candidate in enumerate(candidates) for point in candidate.probes]
-    if over is not None:
-        plans = [plan for turn in itertools.zip_longest(*map(_spread, _each(plans))) for plan in turn if plan]
-    for i, point, column in simulated(fitter, fit, candidates, plans, secants.own, say, over):
-        secants.columns.setdefault(candidates[i].label, []).append((point, column))
-
-
-def _each(plans: Sequence[Plan]) -> list[list[Plan]]:
-    """Those of each candidate."""
-    return [list(own) for _, own in itertools.groupby(plans, lambda plan: plan[0])]
+        secants.own = looked_at(fit, limit)
+        each = [[(c, point) for point in c.probes] for c in candidates]
+        turns = each if over is None else itertools.zip_longest(*map(_spread, each))
+        plans = [plan for turn in turns for plan in turn if plan]
+        for column in simulated(fitter, fit, plans, secants.own, say, over):
+            secants.columns.setdefault(column.candidate.label, []).append(column)
+    found = judged(fitter, fit, secants.of(candidates), secants.own)
+    return sorted(map(_with_others, found.values()), key=lambda s: -s.gain)
 
 
 def _spread(plans: Sequence[Plan]) -> list[Plan]:
@@ -188,23 +205,15 @@ def _spread(plans: Sequence[Plan]) -> list[Plan]:
     return [plans[i] for i in sorted(range(len(plans)), key=place)]
 
 
-def projected(
-    fitter: Fitter, fit: Fit, candidates: Sequence[Candidate], secants: Secants
-) -> dict[int, list[tuple[Screened, Array]]]:
-    known = ((i, *pair) for i, c in enumerate(candidates) for pair in secants.columns.get(c.label, ()))
-    return judged(fitter, fit, candidates, known, secants.own)
-
-
 def simulated(
     fitter: Fitter,
     fit: Fit,
-    candidates: Sequence[Candidate],
     plans: Sequence[Plan],
     own: NDArray[np.int64],
     say: Progress,
     over: Callable[[], bool] | None = None,
-) -> Iterator[tuple[int, Array, Array]]:
-    """(candidate, starting point, what it changes of the residual `[w, n]`) for plans of (candidate, point)."""
+) -> Iterator[Column]:
+    """What candidates at starting points change of the residual of some windows `own`."""
     some = part(fit, own)
     at_once = max(EFFORT.batch * fitter.simulator.lanes // len(own), 1)  # whole calls of the compiled program
     for first in range(0, len(plans), at_once):
@@ -213,32 +222,23 @@ def simulated(
         say("screening", first, len(plans))
         now = plans[first : first + at_once]
         thetas = [
-            fitter.vector((*fit.coordinates, *candidates[i].coordinates), np.concatenate([fit.values, point]))
-            for i, point in now
+            fitter.vector((*fit.coordinates, *c.coordinates), np.concatenate([fit.values, point])) for c, point in now
         ]
         shifted = fitter.simulator.run(np.stack(thetas), np.repeat(some.offsets[None], len(thetas), 0), own)
-        columns = some.r[None] - fitter.whiten(shifted)
-        yield from ((i, point, column) for (i, point), column in zip(now, columns, strict=True))
+        changes = some.r[None] - fitter.whiten(shifted)
+        yield from (Column(*plan, change) for plan, change in zip(now, changes, strict=True))
 
 
 def judged(
-    fitter: Fitter,
-    fit: Fit,
-    candidates: Sequence[Candidate],
-    columns: Iterable[tuple[int, Array, Array]],
-    own: NDArray[np.int64],
-) -> dict[int, list[tuple[Screened, Array]]]:
-    """{candidate: [(what its starting point gains, the point)]} for (candidate, point, column)."""
+    fitter: Fitter, fit: Fit, columns: Iterable[Column], own: NDArray[np.int64]
+) -> dict[str, list[tuple[Screened, Array]]]:
+    """{candidate's label: [(what its starting point gains, the point)]}; on another fit without a simulation."""
     project, share = Projection(fitter, part(fit, own)), len(fit.r) / max(len(own), 1)
-    each: dict[int, list[tuple[Screened, Array]]] = {}
-    for i, point, column in columns:
-        one = _one(project, candidates[i], point, column)
-        each.setdefault(i, []).append((replace(one, gain=one.gain * share), point))
+    each: dict[str, list[tuple[Screened, Array]]] = {}
+    for column in columns:
+        one = _one(project, column)
+        each.setdefault(column.candidate.label, []).append((replace(one, gain=one.gain * share), column.point))
     return each
-
-
-def _ordered(each: dict[int, list[tuple[Screened, Array]]]) -> list[Screened]:
-    return sorted((_with_others(found) for found in each.values()), key=lambda s: -s.gain)
 
 
 def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
@@ -262,14 +262,10 @@ def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
     return replace(first, others=(point, *others, *levels, *whole))
 
 
-def _one(project: Projection, candidate: Candidate, point: Array, column: Array) -> Screened:
-    s, g, norm, projected = project.moments(column)
-    neutral = np.array([c.neutral for c in candidate.coordinates])
-    low, high = (np.array([getattr(c, e) for c in candidate.coordinates]) for e in ("low", "high"))
+def _one(project: Projection, column: Column) -> Screened:
+    s, g, norm, projected = project.moments(column.change)
     if norm < 1e-9 or s <= 1e-9 * norm:
-        return Screened(candidate, point, 0.0, 1.0, projected)
-    way = np.where(candidate.shapes, 0.0, point - neutral)
-    t = float(np.clip(g / s, *room(candidate, way)))
-    gain = 2 * t * g - t * t * s
-    start = np.where(candidate.shapes, point, neutral + (t if abs(t) > 0.02 else 0.02) * (point - neutral))
-    return Screened(candidate, np.clip(start, low, high), max(gain, 0.0), 1.0 - s / norm, projected, whole=2 * g - s)
+        return Screened(column.candidate, column.point, 0.0, 1.0, projected)
+    t = float(np.clip(g / s, *column.room))
+    gain = max(2 * t * g - t * t * s, 0.0)
+    return Screened(column.candidate, column.at(t), gain, 1.0 - s / norm, projected, whole=2 * g - s)

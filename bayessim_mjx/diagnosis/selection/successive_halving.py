@@ -21,7 +21,7 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.journal import Remembering
 from bayessim_mjx.diagnosis.selection.budget import SINGLES, Progress
 from bayessim_mjx.diagnosis.selection.models import Key, Model, scored
-from bayessim_mjx.diagnosis.selection.numbers import EFFORT
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, RELEVANCE
 from bayessim_mjx.diagnosis.selection.screen import looked_at, part
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 
@@ -133,7 +133,7 @@ def _fit_batch(
     every = [several for several, _ in entries.values()]
     part = state.fitter if own is None else fitter_on(state.fitter, own)
     starts = [f if own is None else cut(f, own) for fs in every for f in fs]
-    rules = state.settings.iterations, state.fresh, EFFORT.tolerance
+    rules = state.settings.iterations, state.fresh, RELEVANCE.share
     fits = part.iterate(starts, *rules, progress, halving.among(list(map(len, every))))
     halving.learn(fits)
     rest = iter(fits)
@@ -155,20 +155,15 @@ def _fit_batch(
 def _gaining(
     state: SearchState, part: Fitter, own: NDArray[np.int64], fits: Mapping[Key, Fit], parents: Parents
 ) -> list[Key]:
-    """The models that gain enough on a subset of the windows over the model that they extend."""
+    """The models whose likelihood gains more on a subset of the windows than the prior odds of their effects."""
     share, out = len(own) / len(state.base.fit.r), []
     for key, fit in fits.items():
         parent = parents.get(key)
         before = np.inf if parent is None else cost_on(part, parent.fit, own)
-        if before - fit.cost > share * _least_gain(state, key, parent):
+        more = key - {e.label for e in parent.effects} if parent else frozenset()
+        if before - fit.cost > -2.0 * share * state.log_prior(more):
             out.append(key)
     return out
-
-
-def _least_gain(state: SearchState, key: Key, parent: Model | None) -> float:
-    """The fall of the cost at which the likelihood outweighs the prior odds of the further effects."""
-    more = key - {e.label for e in parent.effects} if parent else frozenset()
-    return -2.0 * state.log_prior(more)
 
 
 def _left_out(state: SearchState, models: Sequence[Sequence[Candidate]], label: str) -> None:

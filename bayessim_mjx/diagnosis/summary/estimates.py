@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis import data_sheet, statistics
 from bayessim_mjx.diagnosis.correction import UNIFORM
 from bayessim_mjx.diagnosis.evidence.parameters import Posterior
-from bayessim_mjx.diagnosis.evidence.selecting import Rival, Selection
-from bayessim_mjx.diagnosis.evidence.weighing import Size, size_of
+from bayessim_mjx.diagnosis.evidence.selecting import Rival, Selection, Size, size_of
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter

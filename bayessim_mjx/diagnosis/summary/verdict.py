@@ -10,14 +10,13 @@ import numpy as np
 from scipy.stats import chi2
 
 from bayessim_mjx.diagnosis import data_sheet
-from bayessim_mjx.diagnosis.evidence.sets import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.phrases.effects import CLEAR
 from bayessim_mjx.diagnosis.residual.origin import Origin, origin
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.numbers import FLOOR
+from bayessim_mjx.diagnosis.selection.numbers import FLOOR, ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import of_one, of_rms
 from bayessim_mjx.diagnosis.summary.again import Whole
 from bayessim_mjx.logs.log import Channels

@@ -14,9 +14,9 @@ from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.request import Request
-from bayessim_mjx.diagnosis.selection.fits import begin
 from bayessim_mjx.diagnosis.selection.models import BASE
 from bayessim_mjx.diagnosis.selection.numbers import PRIORS
+from bayessim_mjx.diagnosis.selection.search_state import begin
 from bayessim_mjx.parameters.parameter import Parameter
 from tests.diagnosis import pendulums
 
@@ -81,7 +81,7 @@ def test_numbers_behind_a_fits_own_change_nothing_of_it():
     fit = Fit((known,), np.zeros(1), *(np.zeros(1),) * 5, 0.0)
     fit = dataclasses.replace(fit, A=np.full((3, 8, 1), 2.0))
     own = doubts.Doubts(np.ones((3, 8, 2)), np.array([[0.0, -3.0]]))
-    more = doubts.doubted(fit, own)
+    more = own.beside(fit)
     assert more.A[0, 0] == pytest.approx([2.0, 1.0, 1.0 - 3.0 * 2.0])
     assert more.A.shape == (3, 8, 3) and not more.values.any() and np.all(more.belief() == 1.0)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.evidence import masked_effects
+from bayessim_mjx.diagnosis.evidence import laws
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.models import scored
 from bayessim_mjx.diagnosis.selection.screen import screen
@@ -25,8 +25,8 @@ def test_what_a_named_law_can_do_by_itself_is_told_as_hidden_beside_it(tmp_path)
     values = {"stiffness": 0.1, "cubic": 0.0, "rest": 0.3}
     start = [next(v for name, v in values.items() if name in c.name) for c in spring.coordinates]
     sprung = scored(fitter, fitter.refresh(fitter.derive(fit, spring.coordinates, np.array(start))), (spring,))
-    assert masked_effects.by_effects(pool, sprung) == (own["actuator_bias"].label,)
+    assert laws.by_effects(pool, sprung) == (own["actuator_bias"].label,)
     dry = own["coulomb_friction"]
     rubbing = fitter.derive(fit, dry.coordinates, np.array([0.03]))
-    assert masked_effects.by_effects(pool, scored(fitter, fitter.refresh(rubbing), (dry,))) == ()
-    assert masked_effects.by_effects(pool, base) == ()
+    assert laws.by_effects(pool, scored(fitter, fitter.refresh(rubbing), (dry,))) == ()
+    assert laws.by_effects(pool, base) == ()

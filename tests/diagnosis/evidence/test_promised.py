@@ -9,7 +9,7 @@ from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.evidence import selecting
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit
-from bayessim_mjx.diagnosis.selection.screen import room
+from bayessim_mjx.diagnosis.selection.screen import Column
 
 GROUPS, EACH, STEPS = 4, 5, 30
 TRUTH = {"a": 0.5, "b": -0.3}
@@ -62,5 +62,5 @@ def test_on_a_linear_problem_the_promise_is_kept():
 
 def test_a_secant_is_not_followed_beyond_the_range():
     effect = Candidate("a", "joint", "joint", (Coordinate("a", (0,), 0.0, -1.0, 1.0),), (False,))
-    assert room(effect, np.array([0.8])) == pytest.approx((-1.25, 1.25))
-    assert room(effect, np.array([-0.1])) == pytest.approx((-10.0, 10.0))
+    assert Column(effect, np.array([0.8]), np.zeros(1)).room == pytest.approx((-1.25, 1.25))
+    assert Column(effect, np.array([-0.1]), np.zeros(1)).room == pytest.approx((-10.0, 10.0))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.evidence import sets
-from bayessim_mjx.diagnosis.evidence.sets import core
+from bayessim_mjx.diagnosis.evidence import weighing
+from bayessim_mjx.diagnosis.evidence.weighing import core
 from bayessim_mjx.diagnosis.selection.numbers import RELEVANCE
 from bayessim_mjx.diagnosis.selection.search_state import log_prior
 
@@ -12,7 +12,7 @@ A, B, AB, NONE = frozenset("a"), frozenset("b"), frozenset("ab"), frozenset()
 
 
 def weighed(evidence, excess, numbers=None):
-    return sets.weighed(evidence, excess, numbers or {k: len(k) for k in evidence}, 30)
+    return weighing.weighed(evidence, excess, numbers or {k: len(k) for k in evidence}, 30)
 
 
 def test_the_prior_expects_one_effect():

@@ -10,8 +10,8 @@ from bayessim_mjx.diagnosis.evidence.gaussian import marginal, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import _truncated
 from bayessim_mjx.diagnosis.evidence.search import Search
 from bayessim_mjx.diagnosis.request import Request
-from bayessim_mjx.diagnosis.selection.fits import begin
 from bayessim_mjx.diagnosis.selection.models import BASE
+from bayessim_mjx.diagnosis.selection.search_state import begin
 from tests.diagnosis import pendulums
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole searches

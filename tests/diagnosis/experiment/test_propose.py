@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
-from bayessim_mjx.diagnosis.evidence.sets import Weighed
+from bayessim_mjx.diagnosis.evidence.weighing import Weighed
 from bayessim_mjx.diagnosis.experiment.limits import limits_of
 from bayessim_mjx.diagnosis.experiment.propose import propose
 from bayessim_mjx.diagnosis.findings import Findings

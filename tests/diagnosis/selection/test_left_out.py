@@ -8,7 +8,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.phrases import verdict
-from bayessim_mjx.diagnosis.selection import fits
+from bayessim_mjx.diagnosis.selection import search_state
 from bayessim_mjx.diagnosis.selection.budget import ENDS, Budget, begun
 from bayessim_mjx.diagnosis.selection.search_state import Settings
 from bayessim_mjx.diagnosis.summary.assemble import not_fitted, not_tried
@@ -114,10 +114,10 @@ def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(monkeyp
         seen.update(steps=fit.steps, screened=screened)
         return []
 
-    monkeypatch.setattr(fits, "scored", lambda fitter, fit, effects: SimpleNamespace(fit=fit))
-    monkeypatch.setattr(fits, "screen", screen)
-    monkeypatch.setattr(fits.SearchState, "rough", False)
-    monkeypatch.setattr(fits.SearchState, "begun", lambda pool, fit: fit)
-    fits.begin(fitter, candidates, settings)
+    monkeypatch.setattr(search_state, "scored", lambda fitter, fit, effects: SimpleNamespace(fit=fit))
+    monkeypatch.setattr(search_state, "screen", screen)
+    monkeypatch.setattr(search_state.SearchState, "rough", False)
+    monkeypatch.setattr(search_state.SearchState, "begun", lambda pool, fit: fit)
+    search_state.begin(fitter, candidates, settings)
     assert (seen["steps"], fitter.refreshed) == (steps, refreshed)
     assert seen["screened"] == windows  # 90 s for 80 points at .1 s a window are 11

@@ -70,7 +70,7 @@ def alone(fitter, model, condition):
 def test_fits_without_a_condition_come_to_their_end_where_one_linear_step_does_not():
     fitter, model = fitted(Bent((0.2, 0.4, 0.9, 4.0)))
     before = fitter.simulator.rollouts
-    (new,) = heldout.refitted(fitter, [model])
+    new = heldout.refitted(fitter, model)
     made = fitter.simulator.rollouts - before  # of all windows, as long as a step promises something
     assert 4 < made <= 4 * EFFORT.rounds
     exact = np.array([alone(fitter, model, g) for g in range(4)])
@@ -82,16 +82,16 @@ def test_fits_without_a_condition_come_to_their_end_where_one_linear_step_does_n
 def test_on_rough_costs_estimates_differ_between_conditions_as_the_data_do():
     """Descent would stop at the next of many small minima, and the jackknife would call that knowledge."""
     fitter, smooth = fitted(Bent((0.3, 0.5, 0.7, 0.9)))
-    (expected,) = heldout.refitted(fitter, [smooth])
+    expected = heldout.refitted(fitter, smooth)
     rough, model = fitted(Bent((0.3, 0.5, 0.7, 0.9), roughness=0.003))
-    (found,) = heldout.refitted(rough, [replace(model, fit=replace(model.fit, A=smooth.fit.A))])
+    found = heldout.refitted(rough, replace(model, fit=replace(model.fit, A=smooth.fit.A)))
     np.testing.assert_allclose(found.estimates - found.fit.values, expected.estimates - expected.fit.values, atol=0.01)
 
 
 def test_a_condition_that_alone_tells_the_parameter_keeps_its_linear_steps():
     fitter, model = fitted(Bent((0.5, 0.5, 0.5, 0.8), felt=(1e-4, 1e-4, 1e-4, 1.0)))
     assert fitter.told_alone(model.fit) == [False, False, False, True]
-    (new,) = heldout.refitted(fitter, [model])
+    new = heldout.refitted(fitter, model)
     assert new.estimates[3] == model.estimates[3]
     assert new.estimates[:3, 0] == pytest.approx(model.fit.values[0], abs=0.01)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from bayessim_mjx.diagnosis.evidence.weighing import Size
+from bayessim_mjx.diagnosis.evidence.selecting import Size
 from bayessim_mjx.diagnosis.summary import estimates
 
 
