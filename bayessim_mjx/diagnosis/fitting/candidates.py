@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx import effects as library
+from bayessim_mjx.diagnosis.data_sheet import WORST
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES
 from bayessim_mjx.diagnosis.fitting.scales import Scales, ranges
 from bayessim_mjx.effects.effect import Block, Effect, Quantity, in_order
@@ -22,7 +23,6 @@ from bayessim_mjx.physics import Physics
 
 Array = NDArray[np.float64]
 STEP = 0.005  # of the range: first finite differences, before `Fit.steps` knows the columns; not counted
-SPAN = 0.4  # of its value, as far as a number is taken to be off where a scale is needed; a rule of thumb
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Coordinate:
     @property
     def step(self) -> float:
         span = self.high - self.low
-        return STEP * (min(span, SPAN * abs(self.neutral)) if self.stated and self.neutral else span)
+        return STEP * (min(span, WORST * abs(self.neutral)) if self.stated and self.neutral else span)
 
 
 @dataclass(frozen=True)

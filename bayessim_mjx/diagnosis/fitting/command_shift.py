@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.data_sheet import WORST
-from bayessim_mjx.diagnosis.fitting.candidates import SPAN, STEP
+from bayessim_mjx.diagnosis.fitting.candidates import STEP
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
 from bayessim_mjx.diagnosis.fitting.substep_errors import Case, Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
@@ -119,7 +119,7 @@ def estimate(errors: Errors, late: Shifted, sigma: Array, force: Array, factor: 
 class _Model:
     """Whitened residuals `[W, n]` as a function of (shift, parameters, gains, forces), each in units of its scale.
 
-    That of the shift is `AROUND`; of parameters their range, or `SPAN` of their value; of gains 1.
+    That of the shift is `AROUND`; of parameters their range, or `WORST` of their value; of gains 1.
     """
 
     def __init__(self, errors: Errors, late: Shifted, sigma: Array, force: Array, factor: int) -> None:
@@ -127,7 +127,7 @@ class _Model:
         space = errors.physics.space
         low, high = (np.array([getattr(p, end) for p in space.parameters]) for end in ("low", "high"))
         self.nominal, self.positive = np.asarray(space.nominal, float), low > 0
-        self.span = np.where(self.nominal != 0, np.minimum(high - low, SPAN * np.abs(self.nominal)), high - low)
+        self.span = np.where(self.nominal != 0, np.minimum(high - low, WORST * np.abs(self.nominal)), high - low)
         self.forces = _shapes(errors.cut) * force  # [4, W, H, nv]
         self.parts = np.cumsum([1, len(low), errors.physics.mj_model.nu])
         self.size = int(self.parts[-1]) + 4 * len(force)

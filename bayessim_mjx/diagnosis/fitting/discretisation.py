@@ -22,6 +22,7 @@ from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.fitting.simulable import contacts
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
+from bayessim_mjx.diagnosis.gap import AT_NOISE
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics import Physics
@@ -30,9 +31,9 @@ Array = NDArray[np.float64]
 
 
 FACTORS = (1, 2, 4)  # on the coarsest stable sub-steps: Richardson's method takes three; a search may take any of them
-# Noises up to which an error of the time step needs no finer sub-steps, and share of the error that the finest have to
-# leave where none is as fine. With contacts the error falls with the root of the step at best. A rule of thumb
-ENOUGH = 0.6
+# Noises up to which an error of the time step needs no finer sub-steps: beside it a model is at the noise. And share of
+# the error that the finest have to leave where none is as fine; with contacts it falls with the root of the step
+ENOUGH = float(np.sqrt(AT_NOISE**2 - 1))
 # Share of what is taken for noise that is the sensors': with less the estimates themselves are too coarse, and windows
 # with contacts are shortened. A rule of thumb, not counted
 BELIEVED = 0.2

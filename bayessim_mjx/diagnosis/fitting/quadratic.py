@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from bayessim_mjx.diagnosis.statistics import times
 
@@ -25,8 +26,7 @@ class Rules:
 
     Attributes:
         parts: in which windows that alone tell a parameter are held out; a window has as many rows at least. A rule of
-            thumb, as the next three.
-        only: times, by which its variance then grows without them: three standard errors.
+            thumb, as the next two.
         trust: share of the curvature: where no data decide, the fit stays put; first damping of a fit.
         far: standard deviations beyond which nothing is chance: 1 in 16 000 of Gaussian errors.
         change: noise sd, rms by which a finite difference changes the residuals: rounding is 2e-4 to 6e-4; one noise
@@ -35,7 +35,6 @@ class Rules:
     """
 
     parts: int = 8
-    only: float = 9.0
     trust: float = 0.001
     far: float = 4.0
     change: float = 0.3
@@ -118,46 +117,16 @@ def blocks(q: Quadratic, starts: Starts, r: Array, A: Array, w: int, count: int 
 
 
 def solve(S: Array, g: Array, low: Array, high: Array) -> Array:
-    """argmin p'Sp - 2 g'p with low <= p <= high (S positive semidefinite): an active set of bounds.
-
-    Bounds are held and released one at a time (primal active set), from the clipped free solution.
-    """
-    k = len(g)
+    """argmin p'Sp - 2 g'p with low <= p <= high (S positive semidefinite), by an active set of bounds."""
     scale = 1 / np.sqrt(np.maximum(np.diag(S), 1e-300))
-    H = S * scale[:, None] * scale[None, :] + 1e-10 * np.eye(k)
-    h, lo, hi = g * scale, low / scale, high / scale
-    p = _cholesky_solve(H, h)
-    if np.all((p >= lo) & (p <= hi)):
-        return p * scale
-    p = np.clip(p, lo, hi)
-    held = (p <= lo) | (p >= hi)
-    for _ in range(20 * k):
-        target = p.copy()
-        if (~held).any():
-            rest = h[~held] - H[np.ix_(~held, held)] @ p[held]
-            target[~held] = _cholesky_solve(H[np.ix_(~held, ~held)], rest)
-        move = target - p
-        with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(move > 0, (hi - p) / move, np.where(move < 0, (lo - p) / move, np.inf))
-        at = int(np.argmin(room))
-        if room[at] < 1.0:  # up to the first bound, which is then held
-            p = np.clip(p + room[at] * move, lo, hi)
-            p[at], held[at] = (hi if move[at] > 0 else lo)[at], True
-            continue
-        p = np.clip(target, lo, hi)
-        slope = H @ p - h
-        inward = held * np.where(p <= lo, -slope, slope)
-        if np.max(inward) < 1e-9:
-            break
-        held[int(np.argmax(inward))] = False  # the one that pulls hardest away from its bound
-    return p * scale
-
-
-def _cholesky_solve(H: Array, h: Array) -> NDArray[np.floating]:
-    try:
-        return np.linalg.solve(H, h)
-    except np.linalg.LinAlgError:
-        return np.linalg.lstsq(H, h, rcond=None)[0]
+    values, vectors = np.linalg.eigh(S * scale[:, None] * scale[None, :])
+    root = np.sqrt(np.maximum(values, 0.0) + 1e-10)
+    A, b = root[:, None] * vectors.T, vectors.T @ (g * scale) / root
+    p = vectors @ (b / root)
+    bounds = low / scale, high / scale
+    if np.any((p < bounds[0]) | (p > bounds[1])):
+        p = lsq_linear(A, b, bounds, method="bvls", max_iter=20 * len(p)).x
+    return np.asarray(p * scale)
 
 
 Split = Callable[[int], Quadratic]
@@ -246,9 +215,12 @@ class Rest:
         return g, S + np.diag(self.precision + RULES.trust * np.diag(S))
 
     def told_by(self, watched: NDArray[np.int64]) -> Callable[[NDArray[np.bool_]], bool]:
-        """Whether some windows (given as `[W]` flags) alone tell one of the parameters `watched`."""
+        """Whether some windows (given as `[W]` flags) alone tell one of the parameters `watched`.
+
+        The others together then tell no more of it than one part of these windows does.
+        """
         known = _variances(self.curvature(np.zeros(len(self.weight), bool))[1])
-        return lambda out: bool((_variances(self.curvature(out)[1]) > RULES.only * known)[watched].any())
+        return lambda out: bool((_variances(self.curvature(out)[1]) > (1 + RULES.parts) * known)[watched].any())
 
     def step(self, out: NDArray[np.bool_], blocks: Sequence[tuple[float, Array, Array]] = ()) -> Array:
         g, S = self.curvature(out, blocks)
