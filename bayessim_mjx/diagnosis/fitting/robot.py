@@ -20,6 +20,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import ParameterSpace, elements
 from bayessim_mjx.physics import Physics
+from bayessim_mjx.physics.native import moved_to_joints
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Task
@@ -155,6 +156,7 @@ def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path
         text = f"{source}: MJX has no integrator implicit; implicitfast is used (no Coriolis terms)"
         warnings.warn(text, stacklevel=3)
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    moved_to_joints(spec)
     model = _by_mujoco("compile", source, spec.compile)
     check(model, source)
     return Robot(model, spec.copy, None, _space(model, parameters), name)._from_data_sheet(parameters is None)
