@@ -28,7 +28,10 @@ def check(model: mujoco.MjModel, source: str) -> None:
     if not np.isin(model.jnt_type, AXIAL).any():
         raise UserError(f"{source}: the model has no hinge or slide joint, so there is no motion to compare")
     if not model.nu:
-        raise UserError(f"{source}: the model has no actuator, so the logged commands cannot act on it")
+        raise UserError(
+            f"{source}: the model has no actuator, so the logged commands cannot act on it; allowed: --drive torque "
+            "(the logs have efforts), --drive position:KP,KV (they have targets), or --drive FILE.yaml by joint"
+        )
     step = float(model.opt.timestep)
     if not (math.isfinite(step) and step > 0):
         raise UserError(f"{source}: <option timestep> = {step:g}; allowed: seconds > 0")
