@@ -3,7 +3,8 @@
 An extended Kalman filter and smoother (Rauch, Tung and Striebel) of the model as it was delivered runs along each log.
 What it finds only says where the windows' start states are first looked for, and how far from there: nothing of it
 enters the likelihood. An unknown acceleration, as large as makes the measurements most likely, stands for what the
-model lacks.
+model lacks. Equality constraints (closed loops, coupled joints) are measurements that follow any motion: they hold as
+exactly as the encoders show.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ Array = NDArray[np.float64]
 # rad or m, rad/s or m/s, of the finite differences: as usual with MuJoCo's own (mjd_transitionFD). Rounding of doubles
 # costs about 1e-10 then; what is lost where a contact begins was not measured.
 NUDGE = 1e-6
+CLOSING = 20  # steps of Gauss-Newton to close a loop from the model's own pose; source: float64, it doubles its digits
 
 
 @dataclass(frozen=True)
@@ -172,7 +174,8 @@ class _Filter:
         noise = np.concatenate([log.sigma_dofs, np.maximum(log.sigma_qvel, RULES.least)])
         wide = np.repeat([RULES.angle, RULES.speed], nv)
         self.prior = np.where(seen, np.minimum(3 * np.maximum(noise, RULES.least), wide), wide)
-        start = log.qpos[0], np.where(seen[nv:], log.qvel[0], 0.0)
+        fixed = seen[:nv]
+        start = stepper.closed(log.qpos[0], fixed), np.where(seen[nv:], log.qvel[0], 0.0)
         for _ in range(RULES.passes):
             self._run(*start)
             qpos, qvel, _ = self._back()
@@ -181,7 +184,7 @@ class _Filter:
     def smoothed(self) -> Way:
         qpos, qvel, spread = self._back()
         sd = np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0))
-        return Way(qpos, qvel, sd, _left(self.ways, self.measured, self.log.period))
+        return Way(qpos, qvel, sd, _left(self.ways, self.held, self.measured, self.log.period))
 
     def _run(self, qpos: Array, qvel: Array) -> None:
         log, stepper, nv = self.log, self.stepper, self.stepper.nv
@@ -191,6 +194,7 @@ class _Filter:
         kept: list[tuple[Array, Array, Array]] = []
         predicted: list[tuple[Array, Array, Array]] = []
         ways: list[Array] = []
+        held: list[Array] = []
         for k in range(len(log)):
             if k:
                 dt = float(log.time[k] - log.time[k - 1])
@@ -200,14 +204,18 @@ class _Filter:
                 ways.append(way)
             predicted.append((qpos, qvel, spread))
             gap = stepper.difference(qpos, qvel, log.qpos[k], log.qvel[k])[rows]
-            inner = spread[np.ix_(rows, rows)] + np.diag(sigma**2)
-            gain = np.linalg.solve(inner, spread[rows]).T
+            bound, broken, loose = stepper.bound(qpos, qvel, self.measured)
+            seen = np.concatenate([np.eye(2 * nv)[rows], bound])
+            gap, noise = np.concatenate([gap, -broken]), np.concatenate([sigma, loose])
+            inner = seen @ spread @ seen.T + np.diag(noise**2)
+            gain = np.linalg.solve(inner, seen @ spread).T
             self.likelihood -= 0.5 * (float(gap @ np.linalg.solve(inner, gap)) + np.linalg.slogdet(inner)[1])
             qpos, qvel = stepper.moved(qpos, qvel, gain @ gap)
-            spread = spread - gain @ spread[rows]
+            spread = spread - gain @ seen @ spread
             spread = 0.5 * (spread + spread.T)
+            held.append(bound / loose[:, None])
             kept.append((qpos, qvel, spread))
-        self.kept, self.predicted, self.ways = kept, predicted, ways
+        self.kept, self.predicted, self.ways, self.held = kept, predicted, ways, held
 
     def _back(self) -> tuple[Array, Array, Array]:
         """Smoothed positions, velocities and covariances of all rows."""
@@ -223,16 +231,20 @@ class _Filter:
         return np.stack(positions), np.stack(velocities), np.stack(spreads)
 
 
-def _left(ways: Sequence[Array], measured: _Measured, period: float) -> Array:
-    """`[2 nv]`, share of a start state's standard deviation that is left after a window without unknown forces."""
+def _left(ways: Sequence[Array], held: Sequence[Array], measured: _Measured, period: float) -> Array:
+    """`[2 nv]`, share of a start state's standard deviation that is left after a window without unknown forces.
+
+    Args:
+        held: of each row the constraints `[m, 2 nv]`, over their standard deviations.
+    """
     size = len(ways[0])
     prior = np.repeat([RULES.angle, RULES.speed], size // 2)
     length = int(np.clip(round(RULES.second / period), 2, len(ways)))
     left = []
     for first in np.linspace(0, len(ways) - length, 5).astype(int):
         way, information = np.eye(size), np.diag(prior**-2.0)
-        for A in ways[first : first + length]:
-            seen = way[measured.rows] / measured.sigma[:, None]
+        for A, bound in zip(ways[first : first + length], held[first : first + length], strict=True):
+            seen = np.concatenate([way[measured.rows] / measured.sigma[:, None], bound @ way])
             information = information + seen.T @ seen
             way = A @ way
         left.append(np.sqrt(np.diag(np.linalg.inv(information))) / prior)
@@ -286,6 +298,7 @@ class Stepper:
     def __init__(self, model: mujoco.MjModel, log: Log) -> None:
         self.model, self.log, self.nv = copy.copy(model), log, int(model.nv)
         self.data, self.longest = mujoco.MjData(self.model), float(model.opt.timestep)
+        self.checked = mujoco.MjData(self.model)  # for constraints: the stepped one keeps its actuators
         declared = controllers.declared(log.metadata)
         source = str(log.metadata.get("source", log.name))
         law = controllers.read(log.metadata, model, log.actuators, source) if declared else None
@@ -310,6 +323,46 @@ class Stepper:
                 data.ctrl[:] = self.loop(command, data.qpos, data.qvel)
             mujoco.mj_step(self.model, data)
         return data.qpos.copy(), data.qvel.copy()
+
+    def bound(self, qpos: Array, qvel: Array, measured: _Measured) -> tuple[Array, Array, Array]:
+        """Equality constraints at a state: (rows `[2 m, 2 nv]` of their derivatives, how far they are off, sd).
+
+        A constraint holds as exactly as the encoders' noise moves it.
+        """
+        nv = self.nv
+        J, off = self._equality(qpos)
+        if not len(J):
+            return np.zeros((0, 2 * nv)), np.zeros(0), np.zeros(0)
+        noise = np.zeros(2 * nv)
+        noise[measured.rows] = measured.sigma
+        sd = np.maximum(np.concatenate([np.linalg.norm(J * n, axis=1) for n in (noise[:nv], noise[nv:])]), RULES.least)
+        none = np.zeros_like(J)
+        return np.block([[J, none], [none, J]]), np.concatenate([off, J @ qvel]), sd
+
+    def _equality(self, qpos: Array) -> tuple[Array, Array]:
+        """(derivatives `[m, nv]` of the active equality constraints by the position, their values `[m]`)."""
+        if not self.model.neq:
+            return np.zeros((0, self.nv)), np.zeros(0)
+        data = self.checked
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(self.model, data)
+        own = np.flatnonzero(data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
+        J = np.zeros((data.nefc, self.nv))
+        if mujoco.mj_isSparse(self.model):
+            mujoco.mju_sparse2dense(J, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
+        else:
+            J = data.efc_J.reshape(data.nefc, self.nv)
+        return J[own].copy(), data.efc_pos[own].copy()
+
+    def closed(self, qpos: Array, fixed: NDArray[np.bool_]) -> Array:
+        """A position with its equality constraints met by the joints that are not `fixed` `[nv]` (Gauss-Newton)."""
+        out = np.array(qpos, float)
+        for _ in range(CLOSING if self.model.neq and not fixed.all() else 0):
+            J, off = self._equality(out)
+            step = np.zeros(self.nv)
+            step[~fixed] = -np.linalg.lstsq(J[:, ~fixed], off, rcond=None)[0]
+            mujoco.mj_integratePos(self.model, out, np.clip(step, -RULES.angle, RULES.angle), 1.0)
+        return out
 
     def linearised(self, qpos: Array, qvel: Array, row: int) -> tuple[Array, Array, Array]:
         """(qpos, qvel) at the next row, and their derivatives by the state `[2 nv, 2 nv]`."""
