@@ -36,7 +36,11 @@ def _parser() -> cli.PlainParser:
     robot = parser.group("robot and logs")
     text = "name of a task, or file.py:Class (bayessim-mjx main --list_tasks)"
     robot.add_argument("--task", metavar="TASK", type=cli.task, help=text)
-    robot.add_argument("--model", metavar="FILE", help="an MJCF model with actuated hinge or slide joints")
+    robot.add_argument("--model", metavar="FILE", help="an MJCF or URDF model with hinge or slide joints")
+    text = "actuators of a model that has none (URDF): torque, position:KP,KV, velocity:KV, or a YAML file by joint"
+    robot.add_argument("--drive", metavar="KIND", help=text)
+    text = "where package://NAME/ of a URDF is: NAME=FOLDER, or a folder of packages (default: above the file)"
+    robot.add_argument("--packages", metavar="DIR", nargs="+", default=[], help=text)
     robot.add_argument("--data", metavar="PATH", nargs="+", help="log files, or folders of them (docs/logs.md)")
     text = "YAML file that maps the columns of the logs to the model (docs/logs.md)"
     robot.add_argument("--map", metavar="FILE", help=text)
@@ -96,6 +100,8 @@ def _output(group: Any) -> None:
 def _checked(args: argparse.Namespace) -> None:
     if (args.task is None) == (args.model is None):
         raise UserError("give one of --task NAME and --model FILE")
+    if args.task and (args.drive or args.packages):
+        raise UserError("--drive and --packages are for --model FILE; a task has its own actuators")
     if not args.data:
         raise UserError("--data is missing: give files or folders of logs")
     cli.writable(args.out, "--out")
@@ -179,7 +185,8 @@ def _diagnose(argv: Sequence[str] | None) -> int:
     given = ("map", "group", "tolerance", "accuracy", "payload", "minutes", "quick", "verdict_only", "seed", "out")
     with warnings.catch_warnings(record=True), stages(args.headless) as say:  # what matters is told with the result
         with run.noting() as notes:
-            nominal = _of_task(args.task, args.parameters) if args.task else of_file(args.model, args.parameters)
+            own = () if args.task else (args.drive, args.packages)
+            nominal = (_of_task if args.task else of_file)(args.task or args.model, args.parameters, *own)
         result = run.diagnose(
             nominal, args.data, effects=effects, progress=say, notes=notes, early=early,
             about={"model": str(args.model or args.task)}, **{key: getattr(args, key) for key in given},

@@ -56,6 +56,8 @@ AMOUNTS: dict[str, Amount] = {
     "actuator_gain": Amount("error", "1", lambda p: abs(p["gain"] - 1)),
     "gain_drift": Amount("change in a minute", "1", _take("drift")),
     "effort_coupling": Amount("share of the effort", "1", _either("to_next", "to_previous")),
+    "servo_stiffness": Amount("error", "1", lambda p: abs(p["factor"] - 1)),
+    "servo_damping": Amount("error", "1", lambda p: abs(p["factor"] - 1)),
     "actuator_bias": Amount("bias", "F", _take("bias")),
     "actuator_deadband": Amount("half width", "command", _take("half_width")),
     "actuator_saturation": Amount("limit", "F", _take("inverse_limit"), inverse=True),

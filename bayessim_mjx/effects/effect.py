@@ -71,6 +71,11 @@ class Effect(abc.ABC):
     follows: ClassVar[bool] = False
     witness: ClassVar[tuple[str, str] | None] = None  # (stream of a log that shows it directly, what to record)
 
+    @classmethod
+    def carries(cls, model: "mujoco.MjModel", i: int) -> bool:
+        """Whether element `i` of its kind has what the effect changes (a servo's gains); it is on offer only there."""
+        return True
+
     def places(self) -> tuple[str, ...]:
         """Names that own a set of parameters."""
         return (self.where,) if isinstance(self.where, str) else tuple(self.where)

@@ -15,6 +15,7 @@ from bayessim_mjx.effects.support import contract
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace, constants
 from bayessim_mjx.physics.gates import chained_in
+from bayessim_mjx.physics.native import absent, own_forces
 from bayessim_mjx.physics.warp import Warp
 
 EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST"))
@@ -82,7 +83,9 @@ class Physics:
         unroll: bool = False,
     ) -> None:
         self.mj_model = mj_model
-        self.effects = tuple(effects)
+        if why := absent(mj_model):
+            raise UserError(f"MJX does not simulate {why}")
+        self.effects = (*effects, *own_forces(mj_model))
         self.model_space = space
         self.blocks = layout(space, self.effects)
         self.space = ParameterSpace(p for block in self.blocks for p in block.parameters)

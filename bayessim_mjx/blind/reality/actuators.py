@@ -79,6 +79,33 @@ class ActuatorGain(ActuatorCause):
         return {"gain": 1 + self.sign * self.size}
 
 
+class ServoStiffness(ActuatorCause):
+    """The servo's kp alone; its kv and force limit are the model's."""
+
+    name = "servo_stiffness"
+    largest = 0.7
+
+    def draw(self, rng: np.random.Generator) -> None:
+        self.sign = float(rng.choice([-1, 1]))
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        actuator = spec.actuator(self.where)
+        actuator.gainprm[0] *= 1 + self.sign * self.size
+        actuator.biasprm[1] *= 1 + self.sign * self.size
+
+    def parameters(self) -> dict[str, float]:
+        return {"factor": 1 + self.sign * self.size}
+
+
+class ServoDamping(ServoStiffness):
+    """The servo's kv alone."""
+
+    name = "servo_damping"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        spec.actuator(self.where).biasprm[2] *= 1 + self.sign * self.size
+
+
 class ActuatorBias(ActuatorCause):
     name = "actuator_bias"
 

@@ -27,7 +27,11 @@ def places(system: Rig, effect: str, scales: Scales) -> list[str]:
     if kind == "actuator":
         alone = effect == "unknown_cross_spring" and len(scales.force) < 2
         linked = [a for a, joint in scales.drives.items() if any(scales.chain[joint])]
-        some = {"actuator_lag": scales.direct, "acceleration_limit": scales.led, "effort_coupling": linked}
+        some = dict.fromkeys(("servo_stiffness", "servo_damping"), scales.servo) | {
+            "actuator_lag": scales.direct,
+            "acceleration_limit": scales.led,
+            "effort_coupling": linked,
+        }
         able = some.get(effect, scales.drives)
         return [] if alone else [a for a in scales.drives if a in able]
     if effect == "ground_height":

@@ -101,6 +101,7 @@ WRITTEN: dict[str, Callable[[Any, Parameters], None]] = {
     "viscous_friction": _size("damping"), "quadratic_drag": _size("coefficient"), "armature": _size("inertia"),
     "joint_spring": _spring, "backlash": _size("gap", 2.0), "joint_elasticity": _size("compliance"),
     "actuator_delay": _size("delay"), "actuator_lag": _size("time_constant"), "actuator_gain": _signed("gain", 1.0),
+    "servo_stiffness": _signed("factor", 1.0), "servo_damping": _signed("factor", 1.0),
     "actuator_bias": _signed("bias"), "actuator_deadband": _size("half_width"), "actuator_saturation": _saturation,
     "speed_torque_limit": _speed_torque, "cogging": _cogging, "gravity_tilt": _tilt,
     "joint_offset": _signed("offset"), "sensor_delay": _size("delay"), "sensor_filter": _size("time_constant"),

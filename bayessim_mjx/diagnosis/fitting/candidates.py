@@ -152,6 +152,8 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
 def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:
     """Joints that never moved tell nothing of what happens in them; nor do contacts of a model without contacts."""
     model = scales.model
+    if not kind.carries(model, element_names(model, kind.kind).index(place)):
+        return False
     if kind.kind == "joint":
         joint = element_names(model, "joint").index(place)
         return bool(scales.moves[model.jnt_dofadr[joint]])

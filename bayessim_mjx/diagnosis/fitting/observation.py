@@ -3,7 +3,8 @@
 An extended Kalman filter and smoother (Rauch, Tung and Striebel) of the model as it was delivered runs along each log.
 What it finds only says where the windows' start states are first looked for, and how far from there: nothing of it
 enters the likelihood. An unknown acceleration, as large as makes the measurements most likely, stands for what the
-model lacks.
+model lacks. Equality constraints (closed loops, coupled joints) are measurements that follow any motion: they hold as
+exactly as the encoders show.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
 from bayessim_mjx.diagnosis.fitting.scales import mass_matrix
@@ -148,14 +150,14 @@ class _Filter:
         seen = np.concatenate([log.seen_dofs, log.seen_dofs | log.seen_speeds])
         noise = np.maximum(np.concatenate([log.sigma_dofs, log.sigma_qvel]), NUDGE)
         self.prior = np.where(seen, np.minimum(3 * noise, _prior(nv)), _prior(nv))
-        self._run(log.qpos[0], np.where(seen[nv:], log.qvel[0], 0.0))
+        self._run(stepper.closed(log.qpos[0], seen[:nv]), np.where(seen[nv:], log.qvel[0], 0.0))
         qpos, qvel, _ = self._back()
         self._run(qpos[0], qvel[0])  # from the smoothed start: it is linearised there
 
     def smoothed(self) -> Way:
         qpos, qvel, spread = self._back()
         sd = np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0))
-        return Way(qpos, qvel, sd, _gained(self.ways, self.measured, self.log.period))
+        return Way(qpos, qvel, sd, _gained(self.ways, self.held, self.measured, self.log.period))
 
     def _run(self, qpos: Array, qvel: Array) -> None:
         log, stepper, nv = self.log, self.stepper, self.stepper.nv
@@ -165,6 +167,7 @@ class _Filter:
         kept: list[tuple[Array, Array, Array]] = []
         predicted: list[tuple[Array, Array, Array]] = []
         ways: list[Array] = []
+        held: list[Array] = []
         for k in range(len(log)):
             if k:
                 dt = float(log.time[k] - log.time[k - 1])
@@ -173,15 +176,18 @@ class _Filter:
                 spread = way @ spread @ way.T + push @ push.T + NUDGE**2 * np.eye(2 * nv)
                 ways.append(way)
             predicted.append((qpos, qvel, spread))
-            gap = stepper.difference(qpos, qvel, log.qpos[k], log.qvel[k])[rows]
-            inner = spread[np.ix_(rows, rows)] + np.diag(sigma**2)
-            gain = np.linalg.solve(inner, spread[rows]).T
+            bound, broken, loose = stepper.bound(qpos, qvel, self.measured)
+            seen = np.concatenate([np.eye(2 * nv)[rows], bound])
+            gap = np.concatenate([stepper.difference(qpos, qvel, log.qpos[k], log.qvel[k])[rows], -broken])
+            inner = seen @ spread @ seen.T + np.diag(np.concatenate([sigma, loose]) ** 2)
+            gain = np.linalg.solve(inner, seen @ spread).T
             self.likelihood -= 0.5 * (float(gap @ np.linalg.solve(inner, gap)) + np.linalg.slogdet(inner)[1])
             qpos, qvel = stepper.moved(qpos, qvel, gain @ gap)
-            spread = spread - gain @ spread[rows]
+            spread = spread - gain @ seen @ spread
             spread = 0.5 * (spread + spread.T)
+            held.append(bound / loose[:, None])
             kept.append((qpos, qvel, spread))
-        self.kept, self.predicted, self.ways = kept, predicted, ways
+        self.kept, self.predicted, self.ways, self.held = kept, predicted, ways, held
 
     def _back(self) -> tuple[Array, Array, Array]:
         """Smoothed positions, velocities and covariances of all rows."""
@@ -202,16 +208,20 @@ def _prior(nv: int) -> Array:
     return np.repeat([1.0, 1 / CUTTING.window], nv)
 
 
-def _gained(ways: Sequence[Array], measured: _Measured, period: float) -> Array:
-    """`[2 nv]`, what a window without unknown forces tells of its start state, in what was known before."""
+def _gained(ways: Sequence[Array], held: Sequence[Array], measured: _Measured, period: float) -> Array:
+    """Return `[2 nv]`, what a window without unknown forces tells of its start state, in what was known before.
+
+    Args:
+        held: of each row the constraints `[m, 2 nv]`, over their standard deviations.
+    """
     size = len(ways[0])
     prior = _prior(size // 2)
     length = int(np.clip(round(CUTTING.window / period), 2, len(ways)))
     gained = []
     for first in np.linspace(0, len(ways) - length, 5).astype(int):
         way, information = np.eye(size), np.diag(prior**-2.0)
-        for A in ways[first : first + length]:
-            seen = way[measured.rows] / measured.sigma[:, None]
+        for A, bound in zip(ways[first : first + length], held[first : first + length], strict=True):
+            seen = np.concatenate([way[measured.rows] / measured.sigma[:, None], bound @ way])
             information = information + seen.T @ seen
             way = A @ way
         gained.append(prior**2 / np.diag(np.linalg.inv(information)) - 1)
@@ -265,6 +275,7 @@ class Stepper:
     def __init__(self, model: mujoco.MjModel, log: Log) -> None:
         self.model, self.log, self.nv = copy.copy(model), log, int(model.nv)
         self.data, self.longest = mujoco.MjData(self.model), float(model.opt.timestep)
+        self.checked = mujoco.MjData(self.model)  # for constraints: the stepped one keeps its actuators
         declared = controllers.declared(log.metadata)
         source = str(log.metadata.get("source", log.name))
         law = controllers.read(log.metadata, model, log.actuators, source) if declared else None
@@ -294,6 +305,51 @@ class Stepper:
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos, qvel, 0.0
         data.ctrl[:] = command if self.loop is None else self.loop(command, data.qpos, data.qvel)
         return np.asarray(command)
+
+    def bound(self, qpos: Array, qvel: Array, measured: _Measured) -> tuple[Array, Array, Array]:
+        """Equality constraints at a state: (rows `[2 m, 2 nv]` of their derivatives, how far they are off, sd).
+
+        A constraint holds as exactly as the encoders' noise moves it.
+        """
+        nv = self.nv
+        J, off = self._equality(qpos)
+        if not len(J):
+            return np.zeros((0, 2 * nv)), np.zeros(0), np.zeros(0)
+        noise = np.zeros(2 * nv)
+        noise[measured.rows] = measured.sigma
+        sd = np.maximum(np.concatenate([np.linalg.norm(J * n, axis=1) for n in (noise[:nv], noise[nv:])]), NUDGE)
+        none = np.zeros_like(J)
+        return np.block([[J, none], [none, J]]), np.concatenate([off, J @ qvel]), sd
+
+    def _equality(self, qpos: Array) -> tuple[Array, Array]:
+        """(derivatives `[m, nv]` of the active equality constraints by the position, their values `[m]`)."""
+        if not self.model.neq:
+            return np.zeros((0, self.nv)), np.zeros(0)
+        data = self.checked
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(self.model, data)
+        own = np.flatnonzero(data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
+        J = np.zeros((data.nefc, self.nv))
+        if mujoco.mj_isSparse(self.model):
+            mujoco.mju_sparse2dense(J, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
+        else:
+            J = data.efc_J.reshape(data.nefc, self.nv)
+        return J[own].copy(), data.efc_pos[own].copy()
+
+    def closed(self, qpos: Array, fixed: NDArray[np.bool_]) -> Array:
+        """A position with its equality constraints met by the joints that are not `fixed` `[nv]`."""
+        if not self.model.neq or fixed.all():
+            return np.array(qpos, float)
+
+        def at(change: Array) -> tuple[Array, Array, Array]:
+            there, whole = np.array(qpos, float), np.zeros(self.nv)
+            whole[~fixed] = change
+            mujoco.mj_integratePos(self.model, there, whole, 1.0)
+            return there, *self._equality(there)
+
+        none = np.zeros(int((~fixed).sum()))
+        best = least_squares(lambda x: at(x)[2], none, jac=lambda x: at(x)[1][:, ~fixed]) if len(at(none)[2]) else None
+        return at(none if best is None else best.x)[0]
 
     def linearised(self, qpos: Array, qvel: Array, row: int, span: float | None = None) -> tuple[Array, Array, Array]:
         """`advanced`, and its derivatives by the state `[2 nv, 2 nv]`."""

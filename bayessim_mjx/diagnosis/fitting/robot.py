@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import mujoco
 import numpy as np
 
-from bayessim_mjx import config
+from bayessim_mjx import config, urdf
 from bayessim_mjx.config import foreign
 from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.fitting.simulable import check, contacts, label, one_line, unreached
@@ -20,6 +20,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import ParameterSpace, elements
 from bayessim_mjx.physics import Physics
+from bayessim_mjx.physics.native import moved_to_joints
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Task
@@ -137,8 +138,13 @@ def of_task(env: "Task", parameters: str | Path | None = None) -> Robot:
     return robot._from_data_sheet(parameters is None)
 
 
-def of_file(path: str | Path, parameters: str | Path | None = None) -> Robot:
+def of_file(
+    path: str | Path, parameters: str | Path | None = None, drive: str | None = None, packages: Sequence[str] = ()
+) -> Robot:
     """The robot of an MJCF (or URDF) file with hinge or slide joints and actuators.
+
+    Args:
+        drive: of a file without actuators, see `urdf.drive`; packages: see `urdf.read`.
 
     Raises:
         UserError: the file is missing, MuJoCo cannot load it, it has nothing to diagnose, or MJX lacks a feature.
@@ -146,7 +152,9 @@ def of_file(path: str | Path, parameters: str | Path | None = None) -> Robot:
     path = Path(path)
     if not path.is_file():
         raise UserError(f"--model {path}: no such file")
-    spec = _by_mujoco("load", str(path), lambda: mujoco.MjSpec.from_file(str(path)))
+    spec = _by_mujoco("load", str(path), lambda: urdf.read(path, packages))
+    if drive is not None:
+        urdf.drive(spec, drive)
     return _of_spec(spec, str(path), path.stem, parameters)
 
 
@@ -155,6 +163,7 @@ def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path
         text = f"{source}: MJX has no integrator implicit; implicitfast is used (no Coriolis terms)"
         warnings.warn(text, stacklevel=3)
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    moved_to_joints(spec)
     model = _by_mujoco("compile", source, spec.compile)
     check(model, source)
     return Robot(model, spec.copy, None, _space(model, parameters), name)._from_data_sheet(parameters is None)

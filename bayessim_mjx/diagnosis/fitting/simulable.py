@@ -10,6 +10,7 @@ import numpy as np
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Physics, mjx
+from bayessim_mjx.physics.native import absent
 
 AXIAL = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
@@ -27,7 +28,10 @@ def check(model: mujoco.MjModel, source: str) -> None:
     if not np.isin(model.jnt_type, AXIAL).any():
         raise UserError(f"{source}: the model has no hinge or slide joint, so there is no motion to compare")
     if not model.nu:
-        raise UserError(f"{source}: the model has no actuator, so the logged commands cannot act on it")
+        raise UserError(
+            f"{source}: the model has no actuator, so the logged commands cannot act on it; allowed: --drive torque "
+            "(the logs have efforts), --drive position:KP,KV (they have targets), or --drive FILE.yaml by joint"
+        )
     step = float(model.opt.timestep)
     if not (math.isfinite(step) and step > 0):
         raise UserError(f"{source}: <option timestep> = {step:g}; allowed: seconds > 0")
@@ -40,10 +44,8 @@ def check(model: mujoco.MjModel, source: str) -> None:
         warnings.warn(f"{source}: gear = 0 of {', '.join(idle)}: these commands do nothing", stacklevel=3)
     if model.nplugin:
         raise UserError(f"{source}: MJX cannot simulate this model: it has plugins")
-    ignored = [what for field, what in _IGNORED.items() if np.any(getattr(model, field, 0.0))]
-    if ignored:
-        text = f"{source}: MJX leaves out {', '.join(ignored)}: effects may be found in their place"
-        warnings.warn(text, stacklevel=3)
+    if why := absent(model):
+        raise UserError(f"{source}: MJX does not simulate {why}")
     try:
         mjx.make_data(mjx.put_model(model, impl="jax"))
     except (NotImplementedError, ValueError, TypeError) as error:
@@ -55,14 +57,6 @@ def _not_finite(model: mujoco.MjModel) -> list[str]:
     fields = ((name, getattr(model, name, None)) for name in dir(model) if not name.startswith("_"))
     floats = ((name, x) for name, x in fields if isinstance(x, np.ndarray) and x.dtype.kind == "f")
     return [name for name, x in floats if not np.isfinite(x).all()]
-
-
-_IGNORED = {  # in the model but not in MJX's equations
-    "actuator_delay": "the actuators' delay",
-    "actuator_damping": "the actuators' damping",
-    "dof_dampingpoly": "nonlinear damping",
-    "jnt_stiffnesspoly": "nonlinear stiffness",
-}
 
 
 def _remedy(message: str) -> str:

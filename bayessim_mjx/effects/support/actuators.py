@@ -30,6 +30,20 @@ def nonlinear(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str |
     return None
 
 
+def servo(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator's force is linear in its own length: a position servo, or a general affine one like it."""
+    linear = model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    fixed = model.actuator_gaintype[actuator] == int(mujoco.mjtGain.mjGAIN_FIXED)
+    return bool(
+        linear and fixed and model.actuator_biasprm[actuator, 1] != 0 and model.actuator_gainprm[actuator, 0] != 0
+    )
+
+
+def scaled(numbers: jax.Array, ids: np.ndarray, column: int, factor: jax.Array) -> jax.Array:
+    """`[nu, k]` numbers of actuators, one column of those at `ids` `[n]` times `factor` `[n]`."""
+    return numbers.at[ids, column].multiply(factor)
+
+
 def limits(actuator: Any) -> np.ndarray | None:
     """(lowest, highest) force of a spec's actuator, None where it has no limit."""
     unlimited = actuator.forcelimited == mujoco.mjtLimited.mjLIMITED_FALSE or not np.any(actuator.forcerange)

@@ -28,6 +28,7 @@ class Placed(Protocol):
     @property
     def quantities(self) -> Sequence[Any]: ...
     def places(self) -> tuple[str, ...]: ...
+    def carries(self, model: mujoco.MjModel, i: int) -> bool: ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -90,7 +91,7 @@ def find(effect: Placed, model: mujoco.MjModel, timestep: float, substeps: int) 
     """Find the site of `effect`; UserError where a place is not in the model or cannot carry it."""
     kind = effect.kind
     names = element_names(model, kind)
-    usable = [i for i in range(len(names)) if _usable(model, kind, i)]
+    usable = [i for i in range(len(names)) if _usable(model, kind, i) and effect.carries(model, i)]
     if effect.where == "all":
         ids = np.asarray(usable, int)
         if not len(ids):
@@ -141,7 +142,8 @@ def _id(effect: Placed, place: str, names: list[str], usable: list[int]) -> int:
         raise UserError(f"{effect.name}: no {kind} {place!r} in the model; {suggest(place, [*names, 'all'])}")
     index = names.index(place)
     if index not in usable:
-        why = "is neither hinge nor slide" if effect.kind == "joint" else "has no mass or cannot move"
+        whys = {"joint": "is neither hinge nor slide", "body": "has no mass or cannot move"}
+        why = whys.get(effect.kind, f"has none of what {effect.name} changes")
         allowed = ", ".join(names[i] for i in usable) or "none"
         raise UserError(f"{effect.name}: {effect.kind} {place!r} {why}; allowed: {allowed}")
     return index

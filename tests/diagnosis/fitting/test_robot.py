@@ -80,9 +80,9 @@ def test_implicit_becomes_implicitfast_with_a_warning(tmp_path):
     assert int(found.mj_model.opt.integrator) == fast == int(found.spec().compile().opt.integrator)
 
 
-def test_what_mjx_leaves_out_is_said(tmp_path):
+def test_what_mjx_leaves_out_is_refused_by_name(tmp_path):
     delayed = MOTOR.replace("/>", ' delay="0.01" nsample="4"/>')
-    with pytest.warns(UserWarning, match=r"a\.xml: MJX leaves out the actuators' delay"):
+    with pytest.raises(UserError, match=r"a\.xml: MJX does not simulate an actuator's delay \(take delay= out"):
         robot.of_file(write(tmp_path / "a.xml", rest=delayed))
 
 

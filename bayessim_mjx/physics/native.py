@@ -1,0 +1,93 @@
+"""Forces of MuJoCo that MJX leaves out: polynomials of joints are added, the rest is moved to joints or refused."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.substep import SubStep
+
+_AXIAL = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+_ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+# field of the model: (what it is, what to write in its place)
+_ABSENT = {
+    "actuator_delay": (
+        "an actuator's delay",
+        "take delay= out of the model: the effect actuator_delay has it, and a diagnosis searches for it",
+    ),
+    "actuator_damping": ("an actuator's damping", "write damping times gear squared at its joint or tendon"),
+    "actuator_armature": ("an actuator's armature", "write armature times gear squared at its joint or tendon"),
+    "jnt_springyield": ("a joint's springyield", "take springyield= out of the model"),
+    "tendon_springyield": ("a tendon's springyield", "take springyield= out of the model"),
+    "tendon_dampingpoly": ("a tendon's polynomial damping", "write one number as its damping"),
+    "tendon_stiffnesspoly": ("a tendon's polynomial stiffness", "write one number as its stiffness"),
+    "actuator_dampingpoly": ("an actuator's polynomial damping", "write it at its joint"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class PolynomialForces(Effect):
+    """F = -(d1 |v| + d2 v^2) v - (k1 x + k2 x^2) x of joints, x from the spring's rest; MuJoCo's own formula.
+
+    It has no parameters and is no candidate.
+    """
+
+    where: str | tuple[str, ...] = "all"
+    name: ClassVar[str] = "polynomial_forces"
+    kind: ClassVar[str] = "joint"
+    quantities: ClassVar[tuple[Quantity, ...]] = ()
+
+    def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
+        model = at.mj_model
+        damping, spring = (jnp.asarray(p) for p in (model.dof_dampingpoly[at.dadr], model.jnt_stiffnesspoly[at.ids]))
+        v, x = step.qvel[at.dadr], step.qpos[at.qadr] - jnp.asarray(model.qpos_spring[at.qadr])
+        drag = (damping[:, 0] * jnp.abs(v) + damping[:, 1] * v**2) * v
+        pull = (spring[:, 0] * x + spring[:, 1] * x**2) * x
+        return memory, at.scatter(-drag - pull)
+
+
+def own_forces(model: mujoco.MjModel) -> tuple[Effect, ...]:
+    """The forces of a model's joints that MJX leaves out, as an effect that is always on; none of most models."""
+    return (PolynomialForces(),) if _polynomial(model).any() else ()
+
+
+def _polynomial(model: mujoco.MjModel) -> np.ndarray:
+    """`[njnt]` bool, joints with polynomial damping or stiffness."""
+    damping, stiffness = getattr(model, "dof_dampingpoly", None), getattr(model, "jnt_stiffnesspoly", None)
+    out = np.zeros(model.njnt, bool)
+    if damping is not None:
+        out[model.dof_jntid[np.any(damping, axis=1)]] = True
+    return out if stiffness is None else out | np.any(stiffness, axis=1)
+
+
+def absent(model: mujoco.MjModel) -> str:
+    """Why MJX would move a model otherwise than MuJoCo, with what to write in its place; "" if it would not."""
+    found = [f"{what} ({way})" for field, (what, way) in _ABSENT.items() if np.any(getattr(model, field, 0.0))]
+    other = _polynomial(model) & ~np.isin(model.jnt_type, _AXIAL)
+    if other.any():
+        names = ", ".join(model.joint(int(j)).name or f"joint{j}" for j in np.flatnonzero(other))
+        found.append(f"polynomial damping or stiffness of {names} (allowed: at hinges and slides)")
+    return "; ".join(found)
+
+
+def moved_to_joints(spec: mujoco.MjSpec) -> None:
+    """Move actuators' damping and armature to the joint or tendon that they drive, in place: the same equations.
+
+    Reflected through the gear they grow by its square. What has another transmission stays, and `absent` names it.
+    """
+    for actuator in spec.actuators:
+        driven = spec.tendon(actuator.target) if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON else None
+        driven = spec.joint(actuator.target) if actuator.trntype in _ON_JOINT else driven
+        if driven is None:
+            continue
+        for name in ("damping", "armature"):
+            own, there = (np.asarray(getattr(x, name), float) for x in (actuator, driven))
+            if own.size and own.flat[0]:
+                more = own.flat[0] * float(actuator.gear[0]) ** 2
+                setattr(driven, name, there + more if there.ndim == 0 else there + np.eye(1, there.size)[0] * more)
+                setattr(actuator, name, own * 0.0 if own.ndim == 0 else own * np.append(0.0, np.ones(own.size - 1)))

@@ -1,0 +1,75 @@
+"""Joints without an encoder that an equality constraint binds: the constraint tells their motion."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from bayessim_mjx.diagnosis.fitting import observation
+from bayessim_mjx.logs import read_logs
+
+FOUR_BAR = """
+<mujoco><option timestep="0.001" integrator="implicitfast"/>
+  <default><geom type="capsule" size="0.012" contype="0" conaffinity="0"/><joint axis="0 1 0" damping="0.01"/></default>
+  <worldbody>
+    <body><joint name="crank" damping="0.05" armature="0.01"/><geom fromto="0 0 0 0 0 0.15" mass="0.3"/>
+      <body name="coupler" pos="0 0 0.15"><joint name="coupler"/><geom fromto="0 0 0 0.3 0 0.05" mass="0.3"/></body>
+    </body>
+    <body name="rocker" pos="0.3 0 0"><joint name="rocker"/><geom fromto="0 0 0 0 0 0.2" mass="0.3"/></body>
+  </worldbody>
+  <equality><connect body1="coupler" body2="rocker" anchor="0.3 0 0.05" solref="0.004 1"/></equality>
+  <actuator><motor name="drive" joint="crank"/></actuator></mujoco>
+"""
+MIMIC = """
+<mujoco><option timestep="0.001" integrator="implicitfast"/>
+  <default><geom type="capsule" size="0.012" contype="0" conaffinity="0"/><joint axis="0 1 0" damping="0.05"/></default>
+  <worldbody>
+    <body><joint name="left" armature=".01"/><geom fromto="0 0 0 0 0 -0.15" mass="0.1"/></body>
+    <body pos=".1 0 0"><joint name="right" armature=".01"/><geom fromto="0 0 0 0 0 -0.15" mass="0.1"/></body>
+  </worldbody>
+  <equality><joint joint1="right" joint2="left" polycoef="0 -1.5 0 0 0" solref="0.004 1"/></equality>
+  <actuator><motor name="drive" joint="left"/></actuator></mujoco>
+"""
+NOISE, PERIOD, ROWS = 5e-4, 0.01, 200
+
+
+def recorded(folder, xml, joint):
+    """(model, the log of one encoder with the rest estimated): a motion of the model itself."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    rows = []
+    for k in range(ROWS):
+        data.ctrl[0] = 0.4 * np.sin(2 * np.pi * 0.7 * k * PERIOD) - 3 * data.joint(joint).qpos[0]
+        rows.append([k * PERIOD, data.ctrl[0], data.joint(joint).qpos[0] + NOISE * rng.normal()])
+        mujoco.mj_step(model, data, round(PERIOD / model.opt.timestep))
+    np.savetxt(folder / "a.csv", rows, delimiter=",", header=f"time,ctrl:drive,qpos:{joint}", comments="")
+    with pytest.warns(UserWarning, match="this motion is estimated from what was measured"):
+        (log,) = read_logs([folder / "a.csv"], model, partial=True)
+    (done,) = observation.completed([log], model)
+    return model, done
+
+
+def rocker_of(crank):
+    """Angle of the rocker by the circles about both ends (law of cosines), as it moves on from 0."""
+    pin = 0.15 * np.stack([np.sin(crank), np.cos(crank)], -1)  # where the coupler hangs: (x, z)
+    reach, length = np.hypot(0.3, 0.05), 0.2
+    way = pin - [0.3, 0]
+    far = np.linalg.norm(way, axis=-1)
+    inner = np.arccos((far**2 + length**2 - reach**2) / (2 * far * length))
+    return np.arctan2(way[..., 0], way[..., 1]) + inner
+
+
+def test_the_loop_of_a_four_bar_tells_its_other_angles(tmp_path):
+    model, log = recorded(tmp_path, FOUR_BAR, "crank")
+    crank, rocker = log.qpos[:, 0], log.qpos[:, 2]
+    assert rocker_of(np.zeros(())) == pytest.approx(0, abs=1e-9)
+    assert np.ptp(rocker) > 0.05  # it moves
+    slope = np.abs(np.gradient(rocker_of(np.linspace(-0.3, 0.3, 61)), 0.01)).max()
+    assert np.abs(rocker - rocker_of(crank)).max() < 5 * NOISE * max(slope, 1)
+    assert log.sigma_qpos[2] < 2 * NOISE
+
+
+def test_a_finger_follows_its_twin(tmp_path):
+    model, log = recorded(tmp_path, MIMIC, "left")
+    left, right = log.qpos.T
+    assert np.abs(right + 1.5 * left).max() < 5 * 1.5 * NOISE
+    assert np.corrcoef(log.qvel.T)[0, 1] < -0.99
