@@ -195,11 +195,7 @@ def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | No
     left = (budget.seconds - budget.spent) / CUTTING.simulations  # s for one simulation of all windows
     steps = integrator_choice.choose(checked.robot, dt, usable, measured, left)
     cuts, step = steps.cuts, steps.worth
-    shift, factor = None, min(step.factor, step.errors.finest) if step.errors else step.factor
-    if step.errors is not None and step.errors.physics.mj_model.nu:  # by how much commands act later than logged
-        shift = command_shift.estimate(
-            step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
-        )
+    shift = _shift(cuts, step, size)
     late = [] if shift is None else shift.notes(checked.period)
     clocked = checked.gate if shift is None else checked.gate.moved(shift.lead)
     period, timestep = float(np.median([log.period for log in usable])), float(checked.robot.mj_model.opt.timestep)
@@ -229,3 +225,15 @@ def _measured(
         if not (contacts(own) and step.lottery) or steps == RULES.parts:
             return cuts, step
         seconds /= 2
+
+
+def _shift(
+    cuts: Callable[..., Windows], step: discretisation.Discretisation, size: scales.Scales
+) -> command_shift.Shift | None:
+    """By how much commands act later or earlier than the logs say."""
+    if step.errors is None or not step.errors.physics.mj_model.nu:
+        return None
+    factor = min(step.factor, step.errors.finest)
+    return command_shift.estimate(
+        step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
+    )

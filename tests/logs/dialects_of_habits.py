@@ -5,7 +5,20 @@ from __future__ import annotations
 from datetime import datetime
 
 import numpy as np
-from dialects import HEADER, NAMES, PLAIN, SERVO_HEADER, TRUTH, Case, dated, servo_truth, stamped, text, with_column
+
+from tests.logs.dialects import (
+    HEADER,
+    NAMES,
+    PLAIN,
+    SERVO_HEADER,
+    TRUTH,
+    Case,
+    dated,
+    servo_truth,
+    stamped,
+    text,
+    with_column,
+)
 
 COUNTER = "forum.arduino.cc: millis() and micros() roll over in the middle of a log"
 NEWEST = "grafana/grafana#28532: exports have the newest row first"

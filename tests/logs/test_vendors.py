@@ -14,7 +14,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from importing import START, call, error, named, stamp
 
 from bayessim_mjx import import_logs
 from bayessim_mjx.errors import UserError
@@ -22,6 +21,7 @@ from bayessim_mjx.logs import Log, read_logs
 from bayessim_mjx.logs.importers import pace
 from bayessim_mjx.logs.importers.ros import Choice, Message, recording
 from bayessim_mjx.logs.vendors import motors
+from tests.logs.importing import START, call, error, named, stamp
 
 STEP = 10_000_000  # ns
 LEG = tuple(f"FL_{part}_joint" for part in ("hip", "thigh", "calf"))

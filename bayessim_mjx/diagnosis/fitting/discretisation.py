@@ -22,8 +22,8 @@ from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.fitting.simulable import contacts
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
-from bayessim_mjx.diagnosis.gap import AT_NOISE
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
+from bayessim_mjx.diagnosis.statistics import AT_NOISE
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics import Physics
 
