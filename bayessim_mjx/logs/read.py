@@ -13,7 +13,7 @@ import numpy as np
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.absent import filled
-from bayessim_mjx.logs.bad_rows import leave_out, oldest_first, without_copies
+from bayessim_mjx.logs.bad_rows import check_markers, leave_out, oldest_first, without_copies
 from bayessim_mjx.logs.check import STREAMS, check_finite, check_motion, check_names, check_time
 from bayessim_mjx.logs.csv_files import read_csv
 from bayessim_mjx.logs.doubts import check_units
@@ -100,6 +100,7 @@ def _read_one(
         metadata, mj_model, channels.actuators, str(path)
     )  # refused here, before anything is simulated
     through, declared = np.asarray(law.through), np.asarray(law.on_position) > 0
+    check_markers(table, columns, sources, channels, log_map)
     check_units(table, columns, channels, mj_model, log_map, through, declared)
     check_motion(table, columns, channels, mj_model, through, absent, declared)
     say_better_clock(table, columns, channels, log_map)
