@@ -155,7 +155,9 @@ def check_motion(
             columns[f"qpos:{joint}"] = _unwrapped(table, joint, columns[f"qpos:{joint}"])
         if kind in ("ball", "free"):
             quat = [f"qpos:{c}" for c in channels.of_joint(joint)[-4:]]
-            columns.update(zip(quat, _quaternion(table, joint, np.stack([columns[c] for c in quat], 1)).T, strict=True))
+            turned = _quaternion(table, joint, np.stack([columns[c] for c in quat], 1))
+            columns.update(zip(quat, turned.T, strict=True))
+            _says_order(table, joint, turned, mj_model.qpos0[channels.columns(joint)][-4:])
     placed(table, columns, channels, mj_model, through, absent, declared)
     for i, (joint, kind) in enumerate(zip(channels.joints, channels.kinds, strict=True)):
         if kind in ("hinge", "slide") and mj_model.jnt_limited[i]:
@@ -219,6 +221,16 @@ def _quaternion(table: Table, joint: str, q: Array) -> Array:
         raise UserError(f"{at}; allowed: norm 1 within 0.01, in the order w x y z")
     flips = np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0))
     return q / norm[:, None] * np.concatenate([[1.0], flips])[:, None]
+
+
+def _says_order(table: Table, joint: str, q: Array, home: Array) -> None:
+    """Warn of quaternions more than a quarter turn from the model's pose throughout, but not in the order x y z w."""
+    here, other = (2.0 * np.arccos(np.clip(np.abs(x @ home), 0.0, 1.0)) for x in (q, q[:, [3, 0, 1, 2]]))
+    if (here > 0.5 * np.pi).all() and (other < 0.5 * np.pi).all():
+        least = f"{np.degrees(here).min():.0f} degrees or more"
+        text = f"{table.path}: quaternion of joint {joint!r} is {least} from the model's"
+        key = f"`qpos: {{{joint}[3]: COLUMN_OF_W, {joint}[4]: COLUMN_OF_X, ...}}`"
+        warnings.warn(f"{text} pose; it may be in the order x y z w: {key} in a map names its columns", stacklevel=4)
 
 
 def _inside(table: Table, column: str, x: Array, bounds: Array, what: str, tolerance: float) -> None:
