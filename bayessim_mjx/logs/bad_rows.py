@@ -8,9 +8,14 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.check import LARGEST, needed_columns
 from bayessim_mjx.logs.log import Array, Channels
+from bayessim_mjx.logs.mapping import LogMap
+from bayessim_mjx.logs.pieces import MIN_ROWS
+from bayessim_mjx.logs.signals import COUNTS, LEVELS, STEPS, quantum
 from bayessim_mjx.logs.table import Table
+from bayessim_mjx.logs.turns import MOST
 from bayessim_mjx.quantities import percent
 
 
@@ -69,6 +74,34 @@ def _tell(
         first = min(set(unreadable) - set(bad))
         texts += [f"fields of {missing} row(s) count as missing, first {table.where(first)}: {unreadable[first]}"]
     warnings.warn(f"{table.path}: bad_rows: {policy}: {'; '.join(texts)}", stacklevel=4)
+
+
+def check_markers(
+    table: Table, columns: Mapping[str, Array], sources: Mapping[str, str], channels: Channels, log_map: LogMap
+) -> None:
+    """Positions do not leave their motion to one same value and return at once: that value stands for a missing one.
+
+    Raises:
+        UserError: a position does so three times or more; names the key `missing`.
+    """
+    stated = {name for name, source, _ in log_map.channels() if source.missing is not None}
+    single = [j for j, kind in zip(channels.joints, channels.kinds, strict=True) if kind in ("hinge", "slide")]
+    for joint in single:
+        name = f"qpos:{joint}"
+        x = columns.get(name, np.zeros(0))
+        if name in stated or len(x) < MIN_ROWS or not np.isfinite(x).all():
+            continue
+        steps, across = np.abs(np.diff(x)), np.abs(x[2:] - x[:-2])
+        usual = max(STEPS * float(np.median(across)), COUNTS * quantum(x))
+        out = (steps[:-1] > usual) & (steps[1:] > usual) & (across < usual)
+        values, counts = np.unique(x[1:-1][out], return_counts=True)
+        marked = values[(counts >= LEVELS) & (counts >= MOST * np.array([np.sum(x == v) for v in values]))]
+        if len(marked):
+            row = int(np.flatnonzero(x == marked[0])[0])
+            count = int(np.sum(x == marked[0]))
+            text = f"{table.path}: column {name!r} leaves its motion for {marked[0]:.6g} in {count} rows"
+            key = f"`qpos: {{{joint}: {{column: {sources.get(name, name)!r}, missing: RAW_NUMBER}}}}`"
+            raise UserError(f"{text}, first {table.where(row)}; {key} and `bad_rows: drop` in a map leave them out")
 
 
 def oldest_first(table: Table, columns: dict[str, Array]) -> tuple[Table, dict[str, Array]]:

@@ -13,6 +13,7 @@ from scipy.ndimage import median_filter
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Channels, suggest
+from bayessim_mjx.logs.signals import STEPS, noise_level
 from bayessim_mjx.logs.stamps import coarseness
 from bayessim_mjx.logs.table import Table
 from bayessim_mjx.logs.turns import placed
@@ -110,7 +111,8 @@ def check_time(table: Table, time: Array, min_rows: int) -> None:
     period = float(np.median(steps))
     if period < SHORTEST:
         text = f"{table.path}: column 'time': median step {period:.4g} s"
-        raise UserError(f"{text}; allowed: seconds, at least {SHORTEST:g} s per row")
+        mend = "days, h or min: `time: {column: time, unit: days}` in the map"
+        raise UserError(f"{text}; allowed: seconds, at least {SHORTEST:g} s per row ({mend})")
     if period > 1.0:
         text = f"{table.path}: column 'time': median step {period:.4g} s"
         names = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
@@ -153,7 +155,9 @@ def check_motion(
             columns[f"qpos:{joint}"] = _unwrapped(table, joint, columns[f"qpos:{joint}"])
         if kind in ("ball", "free"):
             quat = [f"qpos:{c}" for c in channels.of_joint(joint)[-4:]]
-            columns.update(zip(quat, _quaternion(table, joint, np.stack([columns[c] for c in quat], 1)).T, strict=True))
+            turned = _quaternion(table, joint, np.stack([columns[c] for c in quat], 1))
+            columns.update(zip(quat, turned.T, strict=True))
+            _says_order(table, joint, turned, mj_model.qpos0[channels.columns(joint)][-4:])
     placed(table, columns, channels, mj_model, through, absent, declared)
     for i, (joint, kind) in enumerate(zip(channels.joints, channels.kinds, strict=True)):
         if kind in ("hinge", "slide") and mj_model.jnt_limited[i]:
@@ -181,12 +185,31 @@ def _unwrapped(table: Table, joint: str, q: Array) -> Array:
         text = f"{at}: jump from {q[row]:.6g} to {q[row + 1]:.6g} rad in one step; allowed: below pi"
         mend = "degrees: `unit: deg`, counts: `unit: counts` with `resolution`, a wrapped encoder: `wrap`"
         raise UserError(f"{text} ({mend}, another unit: `scale` in the map)")
+    _is_a_turn(table, joint, q, jumps)
     where = table.where(int(jumps[0]) + 1)
     warnings.warn(
         f"{table.path}: column 'qpos:{joint}' wraps by 2 pi {len(jumps)} time(s), first at {where}; unwrapped",
         stacklevel=4,
     )
     return np.unwrap(q)
+
+
+def _is_a_turn(table: Table, joint: str, q: Array, jumps: NDArray[np.int64]) -> None:
+    """Refuse angles that jump by another period than a turn, as registers that run over do."""
+    steps = np.diff(q)
+    beside = np.stack([steps[np.clip(jumps + k, 0, len(steps) - 1)] for k in (-1, 1)])
+    plain = np.abs(beside) < np.pi
+    if not plain.any(axis=0).all():
+        return
+    motion = np.sum(np.where(plain, beside, 0.0), axis=0) / plain.sum(axis=0)
+    period = float(np.median(np.abs(steps[jumps] - motion)))
+    slack = float(np.abs(np.where(plain, beside, 0.0)).max()) + STEPS * noise_level(
+        q
+    )  # a joint moves on by a step or so
+    if abs(period - 2.0 * np.pi) > slack:
+        at = f"{table.path}: column 'qpos:{joint}', {table.where(int(jumps[0]) + 1)}"
+        mend = "`wrap: PERIOD` in raw units in the map lets a register go on"
+        raise UserError(f"{at}: it jumps by {period:.6g}, not by 2 pi; {mend}")
 
 
 def _quaternion(table: Table, joint: str, q: Array) -> Array:
@@ -198,6 +221,16 @@ def _quaternion(table: Table, joint: str, q: Array) -> Array:
         raise UserError(f"{at}; allowed: norm 1 within 0.01, in the order w x y z")
     flips = np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0))
     return q / norm[:, None] * np.concatenate([[1.0], flips])[:, None]
+
+
+def _says_order(table: Table, joint: str, q: Array, home: Array) -> None:
+    """Warn of quaternions more than a quarter turn from the model's pose throughout, but not in the order x y z w."""
+    here, other = (2.0 * np.arccos(np.clip(np.abs(x @ home), 0.0, 1.0)) for x in (q, q[:, [3, 0, 1, 2]]))
+    if (here > 0.5 * np.pi).all() and (other < 0.5 * np.pi).all():
+        least = f"{np.degrees(here).min():.0f} degrees or more"
+        text = f"{table.path}: quaternion of joint {joint!r} is {least} from the model's"
+        key = f"`qpos: {{{joint}[3]: COLUMN_OF_W, {joint}[4]: COLUMN_OF_X, ...}}`"
+        warnings.warn(f"{text} pose; it may be in the order x y z w: {key} in a map names its columns", stacklevel=4)
 
 
 def _inside(table: Table, column: str, x: Array, bounds: Array, what: str, tolerance: float) -> None:

@@ -28,6 +28,7 @@ _KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "suffix": (str, "the text behind each number, such as ' rad'"),
     "range": (list, "two different numbers, the channel at 0 % and at 100 %, such as [0.0, 0.04]"),
     "resolution": ((int, float), "counts per turn, above 0"),
+    "missing": ((int, float), "the raw number that stands for a value that is missing"),
     "zero": ((int, float), "a number, the raw value where the channel is 0"),
     "torque_constant": ((int, float), "N m per A, not 0"),
     "signed": (int, "a number of bits from 2 to 64, such as 16"),
@@ -63,7 +64,7 @@ def _fits(key: str, value: Any) -> bool:
         return bool(_BELOW[key][0] <= value <= _BELOW[key][1])
     if key in ("rate", "resolution"):
         return bool(1e-300 < value < 1e300)
-    if key in ("value", "offset", "wrap", "scale", "zero", "torque_constant"):
+    if key in ("value", "offset", "wrap", "scale", "zero", "missing", "torque_constant"):
         positive = key != "wrap" or value > 0
         return abs(value) < 1e300 and positive and (key not in ("scale", "torque_constant") or value != 0)
     if key == "files":

@@ -40,7 +40,7 @@ class Source:
         signed: bits of a two's complement register that was stored unsigned (16: 65535 means -1).
         sign_magnitude: the bit that holds the sign, counted from 0; those below hold the magnitude (10: 1029 means -5).
             The registers of many hobby servos are of this kind.
-        suffix: text behind each number, such as ` rad`.
+        suffix: text behind each number, such as ` rad`. missing: raw value that stands for a missing one.
         wrap: period [raw units] at which the raw value jumps; it is unwrapped.
     """
 
@@ -58,6 +58,7 @@ class Source:
     sign_magnitude: int | None = None
     wrap: float | None = None
     suffix: str = ""
+    missing: float | None = None
 
     @property
     def stated(self) -> bool:
@@ -93,6 +94,8 @@ class Source:
         Raises:
             UserError: a field that does not fit the register.
         """
+        if self.missing is not None:
+            raw = np.where(raw == self.missing, np.nan, raw)
         if self.signed is not None:
             half = 2.0 ** (self.signed - 1)
             raw = (raw + half) % (2 * half) - half

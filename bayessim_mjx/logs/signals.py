@@ -11,6 +11,10 @@ from bayessim_mjx.logs.log import Array, Channels
 
 MAX_WINDOW = 0.25  # s, the longest smoothing window; rule of thumb, not measured
 _POLYNOMIAL = 3  # the least order whose derivative is exact where the acceleration grows; Savitzky and Golay 1964
+# Rules of thumb: what is off a smooth motion is so many steps of its encoder, and so many usual steps from row to row
+# or standard deviations of the noise, away from it.
+COUNTS = 20.0
+STEPS = 8.0
 # Values that a channel has to show before its noise can be estimated: of two, nothing says whether they are one count
 # apart, so the noise may be anything. Source: that count.
 LEVELS = 3

@@ -14,7 +14,9 @@ from bayessim_mjx.logs.log import Array
 from bayessim_mjx.logs.table import Table
 
 SINCE = (946684800.0, 4102444800.0)  # s since 1970: 2000 to 2100
-DAYS = (36526.0, 73050.0)  # the same in days since 1900, as spreadsheets count
+# the same in days since 1900 (spreadsheets) or 1858 (MJD), since the year 0 (MATLAB), and since 4713 BC (Julian)
+DAYS = ((36526.0, 88070.0), (730486.0, 767011.0), (2451544.0, 2488070.0))
+TICKS = (-11644473600.0, -62135596800.0)  # s since 1970 at which Windows and .NET begin to count 100 ns
 PERIODS = (1e-4, 1.0)  # s between rows of a log of a robot; rule of thumb, not measured
 WINDOW = 7  # rows through which a parabola is put; rule of thumb, not measured
 
@@ -42,9 +44,14 @@ def seconds_of(raw: Array, table: Table, column: str, suffix: str = "") -> Array
         if SINCE[0] <= start * scale <= SINCE[1] and _period(step * scale):
             _say(table, column, f"{unit} since 1970", unit)
             return raw * scale
-    if DAYS[0] <= start <= DAYS[1] and step < 1.2e-5 and _period(step * units.TIMES["days"]):
-        _say(table, column, "days of a spreadsheet", "days")
+    if any(a <= start <= b for a, b in DAYS) and step < 1.2e-5 and _period(step * units.TIMES["days"]):
+        _say(table, column, "days of a spreadsheet or calendar", "days")
         return (raw - start) * units.TIMES["days"]
+    if any(SINCE[0] <= 1e-7 * start + since <= SINCE[1] for since in TICKS):
+        key = f"`time: {{column: {column!r}, scale: 1.0e-07}}`"
+        raise UserError(
+            f"{table.path}: column {column!r}: {start:.0f} counts 100 ns, as Windows does; state {key} in a map"
+        )
     if _written_out(start):
         key = f"`time: {{column: {column!r}, format: '%Y%m%d%H%M%S.%f'}}`"
         raise UserError(

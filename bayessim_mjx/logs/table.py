@@ -133,7 +133,7 @@ class Table:
             return f"{text!r} is not a number by {marks} of the map; `thousands` is the mark between groups of three"
         if re.fullmatch(r"[+-]?[\d.,'\s]+", text):
             return f"{text!r} is not a number; `decimal` and `thousands` in a map state the marks in it (docs/logs.md)"
-        if match := re.fullmatch(r"[+-]?\d[\d.,]*(?:e[+-]?\d+)?(\s*[^\d\s.,_].*)", text):
+        if match := re.fullmatch(r"[+-]?\d[\d.,]*(?:e[+-]?\d+)?(\s*[^\d\s.,_:#/+-].*)", text):
             return (
                 f"{text!r} has a unit behind its number; `suffix: {match[1]!r}` of the channel in a map passes over it"
             )

@@ -6,7 +6,7 @@ import math
 import re
 
 TURN = 2.0 * math.pi
-TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "days": 86400.0}
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "days": 86400.0}
 ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0, "rev": TURN}
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TURNING = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rev/s": TURN, "rpm": TURN / 60.0}
@@ -43,8 +43,8 @@ _SPELT = {
 _IN_BRACKETS = {
     "a": "A", "amp": "A", "amps": "A", "n": "N", "v": "V", "volt": "V", "volts": "V", "m": "m", "nm": "N m",
     "n.m": "N m",
-    "radian": "rad", "radians": "rad", "m/s": "m/s", "min": "min", "rev": "rev", "turn": "rev", "count": COUNTS,
-    "-": PLAIN,
+    "radian": "rad", "radians": "rad", "m/s": "m/s", "min": "min", "h": "h", "rev": "rev", "turn": "rev",
+    "count": COUNTS, "-": PLAIN,
 }  # fmt: skip
 _END = re.compile(r"(?:[\[(<{]\s*([^\])>}]+?)\s*[\])>}]|(?:^|[_\s.:-])([A-Za-zµμ°%]+(?:/s)?))\s*$")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from datetime import datetime
 
 import numpy as np
-
 from tests.logs.dialects import (
     HEADER,
     NAMES,
@@ -13,6 +12,7 @@ from tests.logs.dialects import (
     SERVO_HEADER,
     TRUTH,
     Case,
+    changed,
     dated,
     servo_truth,
     stamped,
@@ -35,6 +35,9 @@ UNKNOWN = "stackoverflow.com, tag units-of-measurement: units that only the name
 INTEGERS = "ROBOTIS-GIT/dynamixel-workbench#315: raw counts of a joint that hardly moves"
 JSON = "stackoverflow.com/questions/7889006: decimal commas of a locale in JSON texts"
 ZONES = "pandas-dev/pandas#15986: names of time zones behind dates"
+
+SHEETS = "elysiate.com/blog: what a spreadsheet shows is no format of interchange"
+DROPPED = "ROBOTIS-GIT/DynamixelSDK#288: a read that failed is logged as 0 or -1"
 
 S = servo_truth()
 T = 2 * np.pi
@@ -66,6 +69,7 @@ def torque(unit: str, per_nm: float) -> bytes:
     return text(with_column(2, per_nm * TRUTH[:, 2], TRUTH), HEADER.replace("ctrl:m_elbow", f"torque {unit}")).encode()
 
 
+OVER = np.where(TRUTH[:, 3] < 0, TRUTH[:, 3] + 6.5536, TRUTH[:, 3])
 SMALL = with_column(4, np.round(3 * np.sin(3 * TRUTH[:, 0])), TRUTH)  # a joint that moves by six counts
 LOOSE = with_column(3, np.round(3 * np.sin(3 * TRUTH[:, 0])), TRUTH)
 
@@ -79,6 +83,21 @@ CASES = [
          ("suffix: ' sec'",), True, {"time": {"column": "time", "suffix": " sec"}}),
     Case("milliseconds at 2 kHz", SLOW, stamped(lambda i: f"{0.5 * i:.1f}").encode(), None, ("unit: ms",),
          truth=with_column(0, 0.5 * K, TRUTH)),
+    Case("days of MATLAB", SHEETS, stamped(lambda i: f"{740045.427 + 0.01 * i / 86400:.11f}").encode(),
+         words=("unit: days",), within=2e-5),
+    Case("ticks of Windows", SHEETS, stamped(lambda i: str(134171123022500000 + 100000 * i)).encode(), None,
+         ("scale: 1.0e-07",), True, {"time": {"column": "time", "scale": 1e-7}}, within=1e-5),
+    Case("a register of an angle that runs over", INTEGERS, text(with_column(3, OVER, TRUTH)).encode(), None,
+         ("qpos:shoulder", "wrap"), True, {**ARM, "qpos": {"elbow": "qpos:elbow",
+         "shoulder": {"column": "qpos:shoulder", "wrap": 6.5536}}}),
+    *(Case(f"{value:g} for what is missing", DROPPED, text(with_column(3, np.where(K % 40 == 20, value, TRUTH[:, 3]),
+           TRUTH)).encode(), None, ("qpos:shoulder", "missing", "bad_rows: drop"), True, {**ARM, "bad_rows": "drop",
+           "qpos": {"elbow": "qpos:elbow", "shoulder": {"column": "qpos:shoulder", "missing": value}}},
+           truth=TRUTH[K % 40 != 20]) for value in (-1.0, 2.5)),
+    Case("a word of C for what is missing", DROPPED, changed(text(TRUTH), 200, "1.99,0,0,1.#QNAN,0").encode(), None,
+         ("bad_rows",), True, {"bad_rows": "drop"}, truth=TRUTH[:199]),
+    Case("signs behind the numbers", DROPPED, text(TRUTH, form=lambda i, j, x: f"{-x:.6f}-" if x < 0 else f"{x:.6f}")
+         .encode(), None, ("is not a number; `bad_rows",), True),
     Case("frame numbers as floats", FRAMES, stamped(lambda i: f"{i:.1f}").encode(), None, ("unit: ms", "unit: s"), True,
          {"time": {"column": "time", "unit": "s"}}, truth=with_column(0, K, TRUTH)),
     Case("dates without marks", COMPACT, stamped(dated("%Y%m%d%H%M%S.%f", datetime(2026, 3, 4, 10, 15, 59))).encode(),

@@ -1,5 +1,6 @@
 """Foreign logs by a map: units, signs, registers, constants; bad maps are refused."""
 
+import warnings
 from pathlib import Path
 
 import mujoco
@@ -55,6 +56,21 @@ def test_free_joint_by_index_and_quaternion_velocity(tmp_path: Path) -> None:
     bad[7, 4:8] *= 1.1
     write(tmp_path, bad, "time," + ",".join(f"qpos:{c}" for c in channels.qpos))
     refused(tmp_path, model, "run.csv", "'root'", "line 9", "norm 1.1")
+
+
+def test_quaternions_in_the_order_of_ros_are_warned_of(tmp_path: Path) -> None:
+    model = mujoco.MjModel.from_xml_string(FREE)
+    half = 0.3 * np.sin(0.05 * np.arange(100))
+    table = np.zeros((100, 8))
+    table[:, 0], table[:, 6], table[:, 7] = 0.01 * np.arange(100), np.sin(half), np.cos(half)
+    write(tmp_path, table, "time," + ",".join(f"qpos:root[{i}]" for i in range(7)))
+    with pytest.warns(UserWarning, match=r"'root' is \d+ degrees or more .*x y z w: `qpos: \{root\[3\]: COLUMN_OF_W"):
+        read_logs(tmp_path, model)
+    entries = {f"root[{i}]": f"qpos:root[{j}]" for i, j in enumerate((0, 1, 2, 6, 3, 4, 5))}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (log,) = read_logs(tmp_path, model, {"qpos": entries})
+    np.testing.assert_allclose(log.qpos[:, 3], np.cos(half), atol=1e-9)
 
 
 def test_map_changes_unit_sign_offset_and_register(tmp_path: Path, arm: mujoco.MjModel) -> None:

@@ -14,14 +14,12 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.importers.messages import FIELDS, Message
 from bayessim_mjx.logs.importers.streams import Stream
 from bayessim_mjx.logs.log import Array
-from bayessim_mjx.logs.signals import derivative, noise_level, quantum
+from bayessim_mjx.logs.signals import COUNTS, STEPS, derivative, noise_level, quantum
 from bayessim_mjx.logs.stamps import WINDOW
 from bayessim_mjx.quantities import percent
 
 # Rules of thumb, not measured.
 LEAST = 5e-3  # rad or m, apart from which two values are two
-COUNTS = 20.0  # steps of an encoder, within which a value may flicker; rule of thumb
-STEPS = 8.0  # usual steps from sample to sample, beyond which a value is off a smooth motion; rule of thumb
 # An order is far better if it leaves less than this share of the variance that the given one leaves, where that is more
 # than this share of all. Counted over simulated chains: of 160 right orders none is doubted, of 106 wrong ones whose
 # joints are driven in different ways 88 are found, 87 with the right order

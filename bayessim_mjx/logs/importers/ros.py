@@ -11,7 +11,6 @@ import numpy as np
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.importers import adapted
-from bayessim_mjx.logs.importers.controller_state import field_used, of_controller, state_of, targets
 from bayessim_mjx.logs.importers.messages import (
     COMMANDS,
     CONTROLLER,
@@ -79,7 +78,7 @@ def _states(name: str, messages: Sequence[Message], choice: Choice) -> list[Mess
     if kind == LOW_STATE:
         motors = adapted.motors_of(name, messages, choice)
         return [adapted.low_state(m, motors) for m in messages]
-    return [adapted.dynamic(m) if kind == DYNAMIC else state_of(m) for m in messages]
+    return [adapted.dynamic(m) if kind == DYNAMIC else adapted.state_of(m) for m in messages]
 
 
 def _sent(
@@ -105,11 +104,11 @@ def _sent(
             others |= dict(adapted.enabled(found, motors, clock))
         else:
             new = _commands(name, topic, found, names or (), list(measured["position"]), choice, clock)
-            notes += [f"{name}: {topic}: {used}" for used in [field_used(found, choice)] if used]
+            notes += [f"{name}: {topic}: {used}" for used in [adapted.field_used(found, choice)] if used]
         if twice := sorted(set(new) & set(sent)):
             raise UserError(f"{name}: {topic} and another topic command {twice[0]!r}; choose by --commands TOPIC")
         if found[0].kind == CONTROLLER:
-            others |= targets(found, clock)
+            others |= adapted.targets(found, clock)
         if hasattr(found[0].body, "data"):
             found_order = better_order(new, measured)
             if found_order is not None:
@@ -191,7 +190,7 @@ def _commands(
     if kind == STATE:
         return _joints(messages, _field(name, topic, [m.body for m in messages], FIELDS, choice), clock, "held")
     if kind == CONTROLLER:
-        return of_controller(name, topic, messages, choice, clock)
+        return adapted.of_controller(name, topic, messages, choice, clock)
     if kind == "JointTrajectory":
         return _trajectory(name, topic, messages, choice, clock)
     each = [np.atleast_1d(np.asarray(m.body.data, float)) for m in messages]
