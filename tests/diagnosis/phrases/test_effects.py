@@ -7,6 +7,7 @@ import pytest
 from bayessim_mjx.diagnosis.correction import Estimate
 from bayessim_mjx.diagnosis.phrases import effects
 from bayessim_mjx.diagnosis.phrases.effects import by_law, missing, titled
+from bayessim_mjx.diagnosis.selection.bounds import Bound
 from tests.diagnosis.phrases.cases import effect
 
 
@@ -83,5 +84,5 @@ def test_an_interval_is_rounded_by_its_width():
 
 def test_a_rival_and_a_parameter_at_its_end():
     assert effects.close_by(3.21, -0.1) == "held-out evidence differs by 3.2 nats, 0 % of the gap"
-    text = effects.at_bound("at most", 0.5, "N m", physical=False)
+    text = effects.at_bound(Bound("at most", 0.5), "N m")
     assert text.startswith("ends at 0.5 N m, the smallest value tried: at most")
