@@ -38,12 +38,6 @@ MOST = 6  # things that a sentence lists: all joints of an arm; a rule of thumb
 CLEAR = -float(ndtri(0.5 / (1.0 + ODDS.strong)))
 
 
-def missing(name: str, where: str) -> str:
-    """Return `a command delay at torque`, after "the simulator lacks"."""
-    own = words(name)
-    return own.at(where, own.lacks)
-
-
 def titled(name: str, where: str) -> str:
     """`extra payload at tool`, on its own."""
     return words(name).at(where)
