@@ -49,8 +49,7 @@ VERDICTS = {
     "unexplained": Verdict(
         Title.UNEXPLAINED.words,
         "A part of the gap is reproducible, but no effect of the library explains it.",
-        "See below where a force is missing, and write its cause as an effect of your own "
-        "(--effects file.py:Name).",
+        "See below where a force is missing, and write its cause as an effect of your own (--effects file.py:Name).",
     ),
     "insufficient_data": Verdict(
         Title.INSUFFICIENT_DATA.words,
