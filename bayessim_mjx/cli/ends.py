@@ -58,7 +58,7 @@ def no_opengl(error: BaseException) -> str:
     files = (Path(frame.f_code.co_filename).parts for frame, _ in traceback.walk_tb(error.__traceback__))
     if not chosen or not any(parts[-1] == "gl_context.py" and "mujoco" in parts for parts in files):
         return ""
-    return f"{OPENGL}={chosen}: OpenGL cannot be loaded; allowed: {LIBRARIES}; install it or choose another"
+    return f"{OPENGL}={chosen}: OpenGL cannot be loaded; allowed: {LIBRARIES}; install it, choose another, or unset it"
 
 
 def _bug() -> int:

@@ -178,8 +178,9 @@ def diagnose(
     """
     with noting() as noticed:
         robot = robot_of(model, parameters).stated(_several(accuracy), _several(payload))
-        recorded = _logs(logs, robot.mj_model, map)
-    about = _header(robot, model, logs, recorded) | {"seed": seed} | dict(about or {})
+        given = [logs] if isinstance(logs, str | Path | Log) else list(logs)
+        recorded = _recorded(given, robot.mj_model, map)
+    about = _header(robot, model, given, recorded) | {"seed": seed} | dict(about or {})
     files = Files(None if out is None else Path(out), about, progress, early)
     request = Request(
         effects=effects, group=group, seed=seed, minutes=minutes, quick=quick, verdict_only=verdict_only,
@@ -218,13 +219,16 @@ def _asked(setup: Setup) -> tuple[str, str]:
     return digest(*question), digest(*code)
 
 
-def _header(robot: Robot, model: Source, logs: Any, recorded: Sequence[Log]) -> dict[str, Any]:
-    """Entries of the report's header."""
+def _header(robot: Robot, model: Source, logs: Sequence[str | Path | Log], recorded: Sequence[Log]) -> dict[str, Any]:
+    """Return entries of the report's header."""
     return {
-        "robot": robot.name, "model": str(model) if isinstance(model, str | Path) else robot.name,
-        "data": _names(logs), "logs": len(recorded), "seconds": float(sum(log.duration for log in recorded)),
+        "robot": robot.name,
+        "model": str(model) if isinstance(model, str | Path) else robot.name,
+        "data": [log.name if isinstance(log, Log) else str(log) for log in logs],
+        "logs": len(recorded),
+        "seconds": float(sum(log.duration for log in recorded)),
         "date": time.strftime("%Y-%m-%d %H:%M"),
-    }  # fmt: skip
+    }
 
 
 @contextmanager
@@ -237,17 +241,11 @@ def noting() -> Iterator[list[str]]:
     notes += dict.fromkeys(str(w.message) for w in caught)
 
 
-def _logs(logs: Any, model: mujoco.MjModel, map: str | Path | None) -> list[Log]:
-    each: list[Any] = [logs] if isinstance(logs, str | Path | Log) else list(logs)
-    if all(isinstance(log, Log) for log in each):
-        return each
-    return read_logs(each if len(each) > 1 else each[0], model, map, partial=True)
+def _recorded(given: list[Any], model: mujoco.MjModel, map: str | Path | None) -> list[Log]:
+    if all(isinstance(log, Log) for log in given):
+        return given
+    return read_logs(given if len(given) > 1 else given[0], model, map, partial=True)
 
 
 def _several(texts: str | Sequence[str]) -> Sequence[str]:
     return [texts] if isinstance(texts, str) else texts
-
-
-def _names(logs: Any) -> list[str]:
-    each = [logs] if isinstance(logs, str | Path | Log) else logs
-    return [log.name if isinstance(log, Log) else str(log) for log in each]

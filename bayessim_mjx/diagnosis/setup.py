@@ -90,13 +90,11 @@ class _Checked:
 
     Attributes:
         robot: as it is simulated beside these logs (`robot.pruned`); dt: control period, s.
-        period: s between rows, the median of all logs.
         look: what the logs show before any simulation; notes: warnings so far.
     """
 
     robot: Robot
     dt: float
-    period: float
     gate: gate.Gate
     look: Look
     notes: tuple[str, ...]
@@ -184,8 +182,7 @@ def _checked(robot: Robot, logs: Sequence[Log], request: Request, looked: Callab
     found = found.of_logs(observation.completed(beginnings, robot.mj_model))
     said += [*found.warnings, *shorter, *(f"{text} (found, not assumed)" for text in found.findings)]
     said += [] if noise.repeats(found.usable) else [noise.ONCE]
-    period = float(np.median([log.period for log in logs]))
-    return _Checked(pruned(robot, found.usable, dt), dt, period, found, look, tuple(said))
+    return _Checked(pruned(robot, found.usable, dt), dt, found, look, tuple(said))
 
 
 def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | None, budget: Budget) -> _Timed:
@@ -196,9 +193,9 @@ def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | No
     steps = integrator_choice.choose(checked.robot, dt, usable, measured, left)
     cuts, step = steps.cuts, steps.worth
     shift = _shift(cuts, step, size)
-    late = [] if shift is None else shift.notes(checked.period)
     clocked = checked.gate if shift is None else checked.gate.moved(shift.lead)
     period, timestep = float(np.median([log.period for log in usable])), float(checked.robot.mj_model.opt.timestep)
+    late = shift.notes(period) if shift is not None else []
     said = [*steps.said(), *notes.rows(period, timestep, dt, dt <= 2 * CUTTING.shortest), *late]
     return _Timed(step.robot(steps.robot), clocked, cuts, step, tuple(said), tuple(steps.warnings()))
 

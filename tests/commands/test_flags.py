@@ -219,7 +219,7 @@ def test_only_what_the_user_can_mend_is_one_line(capsys: pytest.CaptureFixture) 
 def test_an_opengl_library_that_cannot_be_loaded_is_named_with_those_that_are_allowed() -> None:
     """MuJoCo fails when it is imported; a process of its own, as this one has imported it."""
     code = "import sys; from bayessim_mjx import cli; sys.exit(cli.command(lambda argv: __import__('mujoco'))([]))"
-    bogus = os.environ | {"MUJOCO_GL": "bogus"}
+    bogus = os.environ | {"MUJOCO_GL": "bogus", "PYTHONPATH": str(Path(bayessim_mjx.__file__).parents[1])}
     ended = subprocess.run([sys.executable, "-c", code], env=bogus, capture_output=True, text=True)
     assert ended.returncode == 2 and ended.stderr.startswith("error: MUJOCO_GL=bogus: OpenGL cannot be loaded; allowed")
     assert "osmesa" in ended.stderr and ended.stderr.count("\n") == 1

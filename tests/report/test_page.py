@@ -9,6 +9,7 @@ import pytest
 from bayessim_mjx import report
 from bayessim_mjx.diagnosis.phrases.advice import verdict_of
 from bayessim_mjx.diagnosis.result import VERDICTS, load
+from bayessim_mjx.report.look import TONES
 from tests.report import fake
 
 VOID = {
@@ -274,3 +275,11 @@ def test_the_accuracy_of_the_models_numbers_stands_with_them(tmp_path):
     page = rendered(dataclasses.replace(fake.full(), accuracy=own), tmp_path / "a")
     assert "inferred from the logs, as a share: mass 12 % (90 %: 6.0 % – 31 %)." in page.text
     assert "inferred from the logs, as a share" not in rendered(fake.full(), tmp_path / "b").text
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_a_verdict_has_the_colour_of_the_terminal(verdict, tmp_path):
+    on_terminal, on_page = TONES[verdict]
+    assert f"--tone: {on_page};" in report.write(fake.bare(verdict), tmp_path).read_text(encoding="utf-8")
+    others = [page for terminal, page in TONES.values() if terminal == on_terminal]
+    assert set(others) == {on_page}

@@ -49,8 +49,7 @@ VERDICTS = {
     "unexplained": Verdict(
         Title.UNEXPLAINED.words,
         "A part of the gap is reproducible, but no effect of the library explains it.",
-        "See below where the remaining force acts, and write its cause as an effect of your own "
-        "(--effects file.py:Name).",
+        "See below where a force is missing, and write its cause as an effect of your own (--effects file.py:Name).",
     ),
     "insufficient_data": Verdict(
         Title.INSUFFICIENT_DATA.words,
@@ -66,7 +65,7 @@ ALIKE = Verdict(
 PARTLY = Verdict(
     "Partly explained",
     "The named effects leave more of the gap than the tolerance.",
-    "Train with effects.yaml for the effects found. See below where the remaining force acts, and write its cause as "
+    "Train with effects.yaml for the effects found. See below where a force is missing, and write its cause as "
     "an effect of your own (--effects file.py:Name), or allow more with --tolerance.",
 )
 REMAINDER = Verdict(

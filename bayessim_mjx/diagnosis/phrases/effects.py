@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scipy.special import ndtri
 
@@ -13,6 +13,9 @@ from bayessim_mjx.diagnosis.correction import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.selection.numbers import ODDS
 from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import finite, listed, percent
+
+if TYPE_CHECKING:
+    from bayessim_mjx.diagnosis.selection.bounds import Bound
 
 CONTAINS = "contains it as a special case and explains no more"
 NO_GAIN = "no gain at first order"  # why effects were not fitted
@@ -33,12 +36,6 @@ MOST = 6  # things that a sentence lists: all joints of an arm; a rule of thumb
 # standard deviations, 1.98: the odds of a normal number against so large a chance deviation are strong (`Odds.strong`);
 # false reports of fitted values were not counted
 CLEAR = -float(ndtri(0.5 / (1.0 + ODDS.strong)))
-
-
-def missing(name: str, where: str) -> str:
-    """Return `a command delay at torque`, after "the simulator lacks"."""
-    own = words(name)
-    return own.at(where, own.lacks)
 
 
 def titled(name: str, where: str) -> str:
@@ -212,16 +209,16 @@ def close_by(nats: float, behind: float) -> str:
     return f"held-out evidence differs by {nats:.1f} nats, {percent(max(behind, 0.0))} of the gap"
 
 
-def at_bound(kind: str, at: float, unit: str, physical: bool) -> str:
-    """Of a parameter that ends at a bound, see `bounds.Bound`; a clause, after the parameter's name."""
-    if kind == "off":
-        return f"is {at:.3g}: it has no part in the effect"
-    value = f"{at:.3g} {unit}" if unit else f"{at:.3g}"
-    if kind == "end":
+def at_bound(bound: Bound, unit: str) -> str:
+    """Say that a parameter ends at a bound; a clause, after the parameter's name."""
+    if bound.kind == "off":
+        return f"is {bound.at:.3g}: it has no part in the effect"
+    value = f"{bound.at:.3g} {unit}".rstrip()
+    if bound.kind == "end":
         further = f"ends at its bound {value}; a wider range explains no more"
-        return f"ends at {value}, the physical limit" if physical else further
-    which = "largest" if kind == "at least" else "smallest"
-    return f"ends at {value}, the {which} value tried: {kind} this, or another law is behind it"
+        return f"ends at {value}, the physical limit" if bound.physical else further
+    which = "largest" if bound.kind == "at least" else "smallest"
+    return f"ends at {value}, the {which} value tried: {bound.kind} this, or another law is behind it"
 
 
 def not_on_offer(tried: Iterable[str]) -> str:

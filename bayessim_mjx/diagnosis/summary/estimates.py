@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -53,18 +54,11 @@ def answers(effects: list[FoundEffect], experiment: dict[str, Any]) -> list[dict
     return out
 
 
-@dataclass(frozen=True)
-class _Part:
-    """One effect's part of what all close: its share of that (Shapley), closed, with interval, and promised."""
+def _parts(found: Findings, closed: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """{label: numbers of `FoundEffect` on its part of what all close}.
 
-    share: float
-    closed: float
-    ci: tuple[float, float]
-    promised: float
-
-
-def _parts(found: Findings, closed: dict[str, Any]) -> dict[str, _Part]:
-    """{label: part}; the shares are of the linear promise where too many effects are named to fit all subsets."""
+    Shares (Shapley) are of the linear promise where too many effects are named to fit all subsets.
+    """
     base, fitted = found.selection.state.base, found.selection.subsets
     labels = [e.label for e in found.model.effects]
     if not labels:
@@ -77,8 +71,12 @@ def _parts(found: Findings, closed: dict[str, Any]) -> dict[str, _Part]:
     out = {}
     for label, own in zip(labels, each, strict=True):
         part = replace(_closed(found), own=own, every=each.sum(0))
-        share = float(own.sum() / each.sum())
-        out[label] = _Part(share, part.value, part.interval(), closed["each"][label])
+        out[label] = {
+            "share": float(own.sum() / each.sum()) if len(labels) > 1 else math.nan,
+            "gap_closed": part.value,
+            "gap_closed_ci": part.interval(),
+            "predicted_gap_closed": closed["each"][label],
+        }
     return out
 
 
@@ -117,7 +115,7 @@ def nested(found: Findings) -> bool:
     return count - 1 > 1  # others, of which a choice needs two: n - 1 degrees of freedom (Student's t)
 
 
-def _effect(found: Findings, effect: Candidate, sd: Array, part: _Part) -> FoundEffect:
+def _effect(found: Findings, effect: Candidate, sd: Array, part: dict[str, Any]) -> FoundEffect:
     setup, model = found.setup, found.model
     rivals = found.selection.rivals.get(effect.label, ())
     weighed = [r for r in rivals if not r.contains]
@@ -130,7 +128,13 @@ def _effect(found: Findings, effect: Candidate, sd: Array, part: _Part) -> Found
         bound = bounds.of(setup.physics, c, value)
         deviation = float(sd[i]) if bound is None or bound.kind == "off" else float("nan")
         numbers[word] = Estimate(value, deviation, _unit(setup, effect, c.unit), bound.kind if bound else "")
-        clause = _bound(bound, c.unit) if bound else phrases.UNKNOWN if deviation > UNIFORM * (c.high - c.low) else ""
+        clause = (
+            phrases.at_bound(bound, c.unit)
+            if bound
+            else phrases.UNKNOWN
+            if deviation > UNIFORM * (c.high - c.low)
+            else ""
+        )
         ends += [f"{word.replace('_', ' ')} {clause}"] if clause else []
     shared = _shared(effect, size_of(effect, model.fit.values[own], sd[own]), weighed, weights)
     return FoundEffect(
@@ -138,18 +142,11 @@ def _effect(found: Findings, effect: Candidate, sd: Array, part: _Part) -> Found
         where=effect.where,
         parameters=numbers,
         weight_among_rivals=weights[0],
-        gap_closed=part.closed,
-        gap_closed_ci=part.ci,
         equivalent_to=[r.to_dict() | ({"weight": weight_of[id(r)]} if id(r) in weight_of else {}) for r in rivals],
-        sentence=_sentence(ends),
-        predicted_gap_closed=part.promised,
-        share=part.share if len(model.effects) > 1 else float("nan"),
+        sentence=phrases.capital("; ".join(ends)) + "." * bool(ends),
         shared=shared | ({"unit": _unit(setup, effect, shared["unit"])} if shared else {}),
+        **part,
     )
-
-
-def _bound(bound: bounds.Bound, unit: str) -> str:
-    return phrases.at_bound(bound.kind, bound.at, unit, bound.physical)
 
 
 def _shared(effect: Candidate, own: Size, rivals: list[Rival], weights: list[float]) -> dict[str, Any]:
@@ -174,10 +171,6 @@ def _shared(effect: Candidate, own: Size, rivals: list[Rival], weights: list[flo
         "unit": own.unit,
         "quantities": list(dict.fromkeys(s.quantity for s in every)),
     }
-
-
-def _sentence(clauses: list[str]) -> str:
-    return phrases.capital("; ".join(clauses)) + "." * bool(clauses)
 
 
 def _weights(found: Findings, models: list[Model]) -> list[float]:

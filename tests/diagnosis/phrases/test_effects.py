@@ -6,7 +6,8 @@ import pytest
 
 from bayessim_mjx.diagnosis.correction import Estimate
 from bayessim_mjx.diagnosis.phrases import effects
-from bayessim_mjx.diagnosis.phrases.effects import by_law, missing, titled
+from bayessim_mjx.diagnosis.phrases.effects import by_law, numbered, titled
+from bayessim_mjx.diagnosis.selection.bounds import Bound
 from tests.diagnosis.phrases.cases import effect
 
 
@@ -22,9 +23,9 @@ def test_a_tied_effect_and_one_without_a_place_stand_by_themselves():
 
 
 def test_names_of_effects_and_places():
-    assert missing("viscous_friction", "all") == "viscous friction at all joints"
-    assert missing("gravity_tilt", "world") == "the tilt of the base"
-    assert missing("my_effect", "elbow") == "my effect at elbow"
+    assert numbered(effect("viscous_friction", "all")) == "viscous friction at all joints"
+    assert numbered(effect("gravity_tilt", "world")) == "the tilt of the base"
+    assert numbered(effect("my_effect", "elbow")) == "my effect at elbow"
     assert effects.any_of(["actuator_delay@m", "actuator_lag@m"]) == "command delay or actuator lag at m"
     assert effects.any_of(["actuator_delay@m", "sensor_delay@j"]) == "command delay at m or measurement delay at j"
 
@@ -83,5 +84,5 @@ def test_an_interval_is_rounded_by_its_width():
 
 def test_a_rival_and_a_parameter_at_its_end():
     assert effects.close_by(3.21, -0.1) == "held-out evidence differs by 3.2 nats, 0 % of the gap"
-    text = effects.at_bound("at most", 0.5, "N m", physical=False)
+    text = effects.at_bound(Bound("at most", 0.5), "N m")
     assert text.startswith("ends at 0.5 N m, the smallest value tried: at most")

@@ -24,7 +24,7 @@ def test_a_share_that_reaches_no_joint_is_said_to_be_unidentified(monkeypatch, d
     found = SimpleNamespace(setup=SimpleNamespace(physics=None), model=model, selection=SimpleNamespace(rivals={}))
     monkeypatch.setattr(estimates.bounds, "of", lambda physics, coordinate, value: None)
     monkeypatch.setattr(estimates, "_unit", lambda setup, effect, unit: unit)
-    part = estimates._Part(1.0, 1.0, (0.9, 1.0), 1.0)
+    part = {"share": 1.0, "gap_closed": 1.0, "gap_closed_ci": (0.9, 1.0), "predicted_gap_closed": 1.0}
     found_ = estimates._effect(found, effect, np.array([0.003, deviation]), part)
     assert found_.sentence == sentence
     assert found_.parameters["to_previous"].sd == deviation
