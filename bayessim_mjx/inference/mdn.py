@@ -25,7 +25,8 @@ from bayessim_mjx.linalg import inverse_lower, lower_factor, product
 
 Heads = tuple[Array, Array, Array]  # log weights [n, K], centres [n, K, d], factors A [n, K, d, d]
 
-UNUSED = float(np.log(np.finfo(np.float32).tiny))  # log weight of components that a member does not use
+# log weight of components that a member does not use: float32 has no square of less
+UNUSED = float(np.log(np.finfo(np.float32).tiny)) / 2
 LEAST_INSIDE = float(np.log(DEFENSIVE))  # log mass inside the box that training uses at least
 # of the parameters, those that are not trained by gradients; the last three belong to the parts of the mixture
 FIXED = ("used", "sharpness", "share", "member")

@@ -24,7 +24,8 @@ from bayessim_mjx.inference.numbers import ALPHA, DEFENSIVE, WIDER
 ISLANDS = 8  # populations that never exchange draws; source: rule of thumb, not counted
 SPREAD = 2.38  # the best step for Gaussians is this / sqrt(2 d) differences; source: Roberts and Rosenthal 2001
 STILL = float(t.isf(ALPHA / 2, ISLANDS - 1))  # Student's t over the islands of a rise of the log likelihood
-# effective share of the draws at the next power; source: rule of thumb, method of Beskos et al. 2016
+# effective share of the draws at the next power, and correlation with the start that draws may keep; source: rule of
+# thumb, method of Beskos et al. 2016
 KEPT = 0.5
 
 LogLikelihood = Callable[[np.ndarray], np.ndarray]  # u [N, d] -> [N]; not finite: impossible

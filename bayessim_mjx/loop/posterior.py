@@ -47,12 +47,8 @@ def _factors(loop: Loop, state: LoopState) -> tuple[Distribution, list[str]]:
         if float(state.proposals.prior_weight[0]) < REGION:  # else it is the prior itself
             quotients, lost = zip(*(row.divide(at(state.proposals, 0)) for row in rows[:done]), strict=True)
             factors = jax.tree.map(lambda *leaves: jnp.stack(leaves), *quotients, *rows[done:])
-        else:
-            lost = (0.0,)
-        if np.mean(lost) > NEGLIGIBLE:
-            warnings.append(
-                f"{percent(float(np.mean(lost)))} of the posterior's weight cannot be divided by the proposal"
-            )
+            if (share := float(np.mean(lost))) > NEGLIGIBLE:
+                warnings.append(f"{percent(share)} of the posterior's weight cannot be divided by the proposal")
     factors = kept(factors, state.fit.identified, b.priorShare)
     if loop.source.policy_dependent:  # type: ignore[union-attr]
         # an older trajectory was made by an older policy: its posterior stays that of the network of its time

@@ -66,7 +66,8 @@ def infer(loop: Loop, state: LoopState, policy: Policy) -> tuple[LoopState, Evid
         answer, corrected = correct(round_, answer)
         found.append(corrected)
     posterior, moves, moved = ranges.move(loop, state, answer.posterior)
-    described, domain, judged = describe(round_, answer), *conclude(round_, answer, posterior, moves)
+    described = describe(round_, answer)
+    domain, judged = conclude(round_, answer, posterior, moves)
     proposal = rounds.following(posterior, loop.settings.proposal) if loop.sequential else None
     evidence = sum([*found, described, moved, judged], Evidence())
     state = dataclasses.replace(state, **evidence.kept, domain=domain, proposal=proposal)
