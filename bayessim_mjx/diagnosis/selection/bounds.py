@@ -131,7 +131,7 @@ def _grown(physics: Physics, c: Coordinate, value: float, whole: bool = False) -
     if c.neutral == getattr(c, end) and not physics.quantity(c.index[0]).shape:
         return c
     if whole:
-        return replace(c, **{end: far})
+        return replace(c, high=far) if end == "high" else replace(c, low=far)
     if end == "high":
         wider = replace(c, high=min(far, c.neutral + 2 * (c.high - c.neutral)))
     else:
