@@ -1,7 +1,6 @@
 """Every candidate of a setup fitted alone, as a test's beginning."""
 
-from bayessim_mjx.diagnosis.selection.search_state import begin
-from bayessim_mjx.diagnosis.selection.successive_halving import fit_entries
+from bayessim_mjx.diagnosis.selection.successive_halving import begin, fit_entries
 
 
 def fitted(setup, candidates=None):

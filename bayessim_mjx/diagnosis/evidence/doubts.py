@@ -128,9 +128,9 @@ def _rates(fitter: Fitter, rows: NDArray[np.int64]) -> tuple[Array, Array]:
 def common(fitter: Fitter, D: Array, size: Array) -> Array:
     """`[W, n, c]`: what one standard deviation of forces that are alike in all windows does to the residuals.
 
-    Each is as large as the missing force. They are M a, the model's forces by speed and by position, and for each joint
-    any function of its speed and any of its position: values of their own in as many cells of the motion as a window
-    has nodes, all as full.
+    Each is as large as the missing force. They are M a, the model's forces by speed and by position, dry friction, and
+    for each joint any function of its speed and any of its position: values of their own in as many cells of the motion
+    as a window has nodes, all as full.
 
     Args:
         D: as in `disturbance.columns`; size: `[nv]`, rms of the missing force, N m or N.
@@ -152,11 +152,14 @@ def common(fitter: Fitter, D: Array, size: Array) -> Array:
 
 
 def of_motion(fitter: Fitter, nodes: int) -> tuple[Array, Array]:
-    """Forces `[W, 3, nv, m]`, N m or N: M a, by speed, by position; speeds and positions `[W, 2, nv, m]`, at nodes."""
+    """Forces `[W, 4, nv, m]`: M a, by speed, by position (N m or N), by direction (its sign); then the states.
+
+    These are speeds and positions `[W, 2, nv, m]`, all at the nodes.
+    """
     windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
     data, count = mujoco.MjData(model), windows.steps
     at = np.clip(((np.arange(nodes) + 0.5) * count / nodes).round().astype(int), 0, count)
-    out = np.zeros((len(windows), 5, model.nv, nodes))
+    out = np.zeros((len(windows), 6, model.nv, nodes))
     for w, (log, start) in enumerate(zip(windows.log, windows.start, strict=True)):
         rows = start + np.arange(count + 1)
         qpos, qvel = windows.logs[log].qpos[rows], windows.logs[log].qvel[rows]
@@ -164,11 +167,11 @@ def of_motion(fitter: Fitter, nodes: int) -> tuple[Array, Array]:
         for m, row in enumerate(at):
             out[w, :, :, m] = _at(model, data, qpos[row], qvel[row], qacc[row])
     out = np.nan_to_num(out)
-    return out[:, :3], out[:, 3:]
+    return out[:, :4], out[:, 4:]
 
 
 def _at(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array, qvel: Array, qacc: Array) -> Array:
-    """`[5, nv]` at one state."""
+    """`[6, nv]` at one state."""
     data.qpos[:], data.qvel[:] = qpos, 0.0
     mujoco.mj_fwdPosition(model, data)
     mujoco.mj_fwdVelocity(model, data)
@@ -181,7 +184,7 @@ def _at(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array, qvel: Array, qa
     by_speed = data.qfrc_bias - data.qfrc_passive - by_position
     affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
     drives = np.where(affine, model.actuator_biasprm[:, 2], 0.0) * data.actuator_velocity
-    return np.stack([inertial, by_speed - drives @ moments(model, data), by_position, qvel, position])
+    return np.stack([inertial, by_speed - drives @ moments(model, data), by_position, np.sign(qvel), qvel, position])
 
 
 def moments(model: mujoco.MjModel, data: mujoco.MjData) -> Array:

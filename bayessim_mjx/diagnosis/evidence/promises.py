@@ -203,7 +203,7 @@ def _sets(promises: Promises, price: float) -> list[Promise]:
     """Single columns, pairs, and larger sets that grow from the best of these as long as each more pays its price."""
     columns, usable = promises.columns, range(len(promises.columns))
     blocked = np.array([[not beside(a.candidate, b.candidate) for b in columns] for a in columns])
-    found = {(j,): promises.of((j,)) for j in usable}
+    found = {p.own: p for p in map(promises.of, ((j,) for j in usable))}
     found |= {p.own: p for p in promises.pairs(blocked, 2 * EFFORT.batch)}
     for seed in sorted(found.values(), key=lambda p: price * len(p.own) - p.nats)[: EFFORT.sets[1]]:
         grown = seed

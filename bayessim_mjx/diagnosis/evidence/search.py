@@ -30,8 +30,8 @@ from bayessim_mjx.diagnosis.selection.bounds import widened
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER, Progress
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS
-from bayessim_mjx.diagnosis.selection.search_state import SearchState, cut_back, polish
-from bayessim_mjx.diagnosis.selection.successive_halving import Entries, fit_entries
+from bayessim_mjx.diagnosis.selection.search_state import SearchState
+from bayessim_mjx.diagnosis.selection.successive_halving import Entries, cut_back, fit_entries, polish
 
 Array = NDArray[np.float64]
 

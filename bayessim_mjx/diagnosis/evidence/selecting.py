@@ -22,8 +22,8 @@ from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model
 from bayessim_mjx.diagnosis.selection.screen import Column
-from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings, begin, cut_back
-from bayessim_mjx.diagnosis.selection.successive_halving import Entries, fit_entries
+from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings
+from bayessim_mjx.diagnosis.selection.successive_halving import Entries, begin, cut_back, fit_entries
 from bayessim_mjx.diagnosis.statistics import Gap, shapley
 
 Array = NDArray[np.float64]

@@ -14,7 +14,8 @@ from bayessim_mjx.diagnosis.fitting.quadratic import solve
 from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
 from bayessim_mjx.diagnosis.selection.models import Model, nats, scored
 from bayessim_mjx.diagnosis.selection.numbers import ODDS, PRIORS
-from bayessim_mjx.diagnosis.selection.search_state import AFRESH, SearchState
+from bayessim_mjx.diagnosis.selection.search_state import SearchState
+from bayessim_mjx.diagnosis.selection.successive_halving import AFRESH
 from bayessim_mjx.physics import Physics
 
 SINGLE = float(np.finfo(np.float32).eps)  # values are written into the model in single precision
@@ -131,7 +132,7 @@ def _grown(physics: Physics, c: Coordinate, value: float, whole: bool = False) -
     if c.neutral == getattr(c, end) and not physics.quantity(c.index[0]).shape:
         return c
     if whole:
-        return replace(c, **{end: far})
+        return replace(c, high=far) if end == "high" else replace(c, low=far)
     if end == "high":
         wider = replace(c, high=min(far, c.neutral + 2 * (c.high - c.neutral)))
     else:

@@ -205,7 +205,7 @@ class Closed:
         if len(rows) < 2 or math.isnan(value):
             return statistics.NOTHING
         (before, left, noise), without = self._sums(np.ones(len(self.before))), self._sums(rows)
-        off = max(1.0 - float(self.after.sum()) / noise, 0.0)  # of the floor
+        off = max(1.0 - float(self.after.sum() / noise), 0.0)  # of the floor
         left, left_without = (np.maximum(x, 1e-9) for x in (left, without[1]))
 
         def beyond(share: float) -> float:

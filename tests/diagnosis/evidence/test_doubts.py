@@ -16,7 +16,7 @@ from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.models import BASE
 from bayessim_mjx.diagnosis.selection.numbers import PRIORS
-from bayessim_mjx.diagnosis.selection.search_state import begin
+from bayessim_mjx.diagnosis.selection.successive_halving import begin
 from bayessim_mjx.parameters.parameter import Parameter
 from tests.diagnosis import pendulums
 

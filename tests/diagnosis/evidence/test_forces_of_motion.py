@@ -30,21 +30,21 @@ def test_terms_of_a_driven_pendulum_by_hand():
     assert inertial == pytest.approx(about_joint * a)
     assert by_speed == pytest.approx((0.3 + 4 * 2**2) * v)
     assert by_position == pytest.approx(1.5 * 9.81 * 0.25 * np.sin(q) + 2 * q)
-    assert found[3:] == pytest.approx([v, q])
+    assert found[3:] == pytest.approx([-1.0, v, q])
 
 
 def test_a_number_that_takes_a_common_force_is_as_uncertain_as_that_force(monkeypatch):
     """A mass whose column is the inertial force: of 2 N m rms and a missing force of .01 N m it is known to .5 %."""
     rng = np.random.default_rng(0)
-    forces, states, D = np.zeros((5, 3, 1, 4)), rng.normal(size=(5, 2, 1, 4)), rng.normal(size=(5, 30, 4))
+    forces, states, D = np.zeros((5, 4, 1, 4)), rng.normal(size=(5, 2, 1, 4)), rng.normal(size=(5, 30, 4))
     forces[:, 0, 0] = rng.normal(size=(5, 4))
     forces *= 2.0 / np.sqrt(np.mean(forces[:, 0] ** 2))
     monkeypatch.setattr(doubts, "of_motion", lambda fitter, nodes: (forces, states))
     column = (D @ forces[:, 0, 0, :, None])[..., 0]
     found = doubts.common(SimpleNamespace(), D, np.array([0.01]))
     assert np.sum(column * found[..., 0]) / np.sum(column**2) == pytest.approx(0.005)
-    assert found.shape == (5, 30, 3 + 2 * 4) and not found[..., 1:3].any()
-    for cells in np.split(found[..., 3:], 2, axis=2):  # by speed, by position: each node is in one cell
+    assert found.shape == (5, 30, 4 + 2 * 4) and not found[..., 1:4].any()
+    for cells in np.split(found[..., 4:], 2, axis=2):  # by speed, by position: each node is in one cell
         np.testing.assert_allclose(cells.sum(2), 0.01 * D.sum(2))
     assert not doubts.common(SimpleNamespace(), D, np.zeros(1)).size
 

@@ -11,7 +11,7 @@ from bayessim_mjx.diagnosis.evidence.parameters import _truncated
 from bayessim_mjx.diagnosis.evidence.search import Search
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection.models import BASE
-from bayessim_mjx.diagnosis.selection.search_state import begin
+from bayessim_mjx.diagnosis.selection.successive_halving import begin
 from tests.diagnosis import pendulums
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole searches

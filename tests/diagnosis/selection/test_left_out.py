@@ -8,7 +8,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.phrases import verdict
-from bayessim_mjx.diagnosis.selection import search_state
+from bayessim_mjx.diagnosis.selection import successive_halving
 from bayessim_mjx.diagnosis.selection.budget import ENDS, Budget, begun
 from bayessim_mjx.diagnosis.selection.search_state import Settings
 from bayessim_mjx.diagnosis.summary.assemble import not_fitted, not_tried
@@ -114,10 +114,10 @@ def test_the_fit_of_the_known_parameters_ends_with_its_share_of_the_time(monkeyp
         seen.update(steps=fit.steps, screened=screened)
         return []
 
-    monkeypatch.setattr(search_state, "scored", lambda fitter, fit, effects: SimpleNamespace(fit=fit))
-    monkeypatch.setattr(search_state, "screen", screen)
-    monkeypatch.setattr(search_state.SearchState, "rough", False)
-    monkeypatch.setattr(search_state.SearchState, "begun", lambda pool, fit: fit)
-    search_state.begin(fitter, candidates, settings)
+    monkeypatch.setattr(successive_halving, "scored", lambda fitter, fit, effects: SimpleNamespace(fit=fit))
+    monkeypatch.setattr(successive_halving, "screen", screen)
+    monkeypatch.setattr(successive_halving.SearchState, "rough", False)
+    monkeypatch.setattr(successive_halving.SearchState, "begun", lambda pool, fit: fit)
+    successive_halving.begin(fitter, candidates, settings)
     assert (seen["steps"], fitter.refreshed) == (steps, refreshed)
     assert seen["screened"] == windows  # 90 s for 80 points at .1 s a window are 11
