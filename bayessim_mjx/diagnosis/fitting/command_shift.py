@@ -14,37 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.fitting.candidates import SPAN
+from bayessim_mjx.diagnosis.data_sheet import WORST
+from bayessim_mjx.diagnosis.fitting.candidates import STEP
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
 from bayessim_mjx.diagnosis.fitting.substep_errors import Case, Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck.timing import SURE
+from bayessim_mjx.effects.support.motion import AROUND
 
 Array = NDArray[np.float64]
 Shifted = Callable[[float], Windows]  # s -> the windows with commands that act so much later
-
-
-@dataclass(frozen=True)
-class Rules:
-    """How a shift is estimated, and when it is reported. Chosen on the shifts of its tests; error rates not counted."""
-
-    rounds: int = 3  # Newton steps with the first one's derivatives
-    nudge: float = 0.1  # control steps, of the shift for its finite difference
-    shares: tuple[float, ...] = (1.0, 0.5, 0.2)  # of a step, until the error falls
-    small: float = 0.02  # of scales, of the other columns' finite differences
-    # standard deviation of parameters (of their range, or of `SPAN` of their value), gains and forces (of their scale)
-    prior: float = 0.3
-    least: float = 0.2  # of the lower end of a range, of a positive parameter
-    furthest: float = 0.02  # s, or three control steps
-    direction: float = 0.1  # of the typical speed, at which friction has turned round
-    least_late: tuple[float, float] = (0.05, 0.0001)  # control steps and s: what a simulator's own step may be worth
-    explains: float = 0.75  # of the cost above the noise: what else is missing would leave more
-    seen: float = 0.02  # of the noise's own cost
-    alike: float = 0.4  # of the shift, by which that of a condition may differ
-    hinted: tuple[float, float] = (6.0, 0.1)  # standard errors and control steps of a lead beside a gap of another kind
-
-
-RULES = Rules()
+LEAST = 0.05  # control steps: a simulator's own step may be worth as much; a rule of thumb
 
 
 @dataclass(frozen=True)
@@ -53,31 +33,29 @@ class Shift:
 
     Attributes:
         late: s later than the log says; negative: earlier. error: its standard error.
+        apart: s, standard deviation of the conditions' own shifts beyond their errors.
         explains: share of the cost above the noise that the shift alone removes.
-        apart: largest difference of a condition's own shift, beyond its error, in shifts.
-        seen: cost that it removes, in costs of the noise.
         step: s, the control step.
     """
 
     late: float
     error: float
-    explains: float
     apart: float
-    seen: float
+    explains: float
     step: float
 
     @property
     def certain(self) -> bool:
-        """Whether nothing else that is known would do as well."""
-        steps, least = RULES.least_late
-        significant = abs(self.late) > max(SURE * self.error, steps * self.step, least) and self.seen > RULES.seen
-        return significant and self.explains > RULES.explains and self.apart < RULES.alike
+        """Whether it explains more than all else that is missing does, in all conditions alike."""
+        return self._shows(abs(self.late), self.error + self.apart) and self.explains > 1 - self.explains
 
     @property
     def likely(self) -> bool:
         """Whether there is a lead, but beside a gap that something else has to explain."""
-        errors, steps = RULES.hinted
-        return not self.certain and -self.late > max(errors * self.error, steps * self.step)
+        return self._shows(-self.late, self.error) and not self.certain
+
+    def _shows(self, size: float, error: float) -> bool:
+        return size > max(SURE * error, LEAST * self.step)
 
     @property
     def lead(self) -> float:
@@ -117,61 +95,64 @@ def estimate(errors: Errors, late: Shifted, sigma: Array, force: Array, factor: 
         factor: sub-steps per timestep of the model, at most `errors.finest`.
     """
     cut, model = errors.cut, _Model(errors, late, sigma, force, factor)
-    precision = np.append(0.0, np.full(model.size - 1, RULES.prior**-2))
-    nudges = np.append(RULES.nudge * cut.dt, np.full(model.size - 1, RULES.small))
+    precision = np.full(model.size, WORST**-2)
     x, starts = np.zeros(model.size), np.zeros_like(errors.offsets)
     r = model.residual(x, starts)
-    A = model.columns(nudges)
+    A = model.columns()
     B = errors.columns(sigma)
-    for _ in range(RULES.rounds):
+    share, gained = 1.0, np.inf
+    while gained > len(cut) and abs(x[0]) < 1:  # a squared noise a window; by derivatives at the beginning
         q, found = eliminate(r, A, B, errors.offsets + starts, cut.spread)
         g, S = q.weighted(np.ones(len(cut)))
-        step = np.asarray(np.linalg.solve(S + np.diag(precision), g - precision * x), np.float64)
-        for share in RULES.shares:
-            moved = x + share * step, starts + share * found.step(A, step)
-            there = model.residual(*moved)
-            if np.sum(there**2) < np.sum(r**2):
-                (x, starts), r = moved, there
-                break
-        if abs(x[0]) > max(RULES.furthest, 3 * cut.dt):
-            return None
+        step = share * np.asarray(np.linalg.solve(S + np.diag(precision), g - precision * x), np.float64)
+        moved = x + step, starts + share * found.step(A, step / share)
+        there = model.residual(*moved)
+        gained = float(np.sum(r**2) - np.sum(there**2))
+        if gained > 0:
+            (x, starts), r = moved, there
+        elif share == 1:
+            share, gained = 0.5, np.inf
+    if abs(x[0]) >= 1:
+        return None
     return _judged(eliminate(r, A, B, errors.offsets + starts, cut.spread)[0], x, precision, cut, r.size - starts.size)
 
 
 class _Model:
-    """Whitened residuals `[W, n]` as a function of (shift, parameters, gains, forces)."""
+    """Whitened residuals `[W, n]` as a function of (shift, parameters, gains, forces), each in units of its scale.
+
+    That of the shift is `AROUND`; of parameters their range, or `WORST` of their value; of gains 1.
+    """
 
     def __init__(self, errors: Errors, late: Shifted, sigma: Array, force: Array, factor: int) -> None:
         self.errors, self.late, self.sigma, self.factor = errors, late, sigma, factor
         space = errors.physics.space
-        self.low, self.high = (np.array([getattr(p, end) for p in space.parameters]) for end in ("low", "high"))
-        self.nominal = np.asarray(space.nominal, float)
-        span = self.high - self.low
-        self.span = np.where(self.nominal != 0, np.minimum(span, SPAN * np.abs(self.nominal)), span)
-        self.least = np.where(self.low > 0, RULES.least * self.low, -np.inf)
+        low, high = (np.array([getattr(p, end) for p in space.parameters]) for end in ("low", "high"))
+        self.nominal, self.positive = np.asarray(space.nominal, float), low > 0
+        self.span = np.where(self.nominal != 0, np.minimum(high - low, WORST * np.abs(self.nominal)), high - low)
         self.forces = _shapes(errors.cut) * force  # [4, W, H, nv]
-        self.parts = np.cumsum([1, len(self.low), errors.physics.mj_model.nu])
+        self.parts = np.cumsum([1, len(low), errors.physics.mj_model.nu])
         self.size = int(self.parts[-1]) + 4 * len(force)
 
-    def columns(self, nudges: Array) -> Array:
-        """`[W, n, size]`, minus the derivatives of the residuals, by differences of `nudges`."""
-        here = np.zeros((1, self.size))
-        first, *there = self._residuals(self.errors.differences(self.factor), [*here, *np.diag(nudges)])
-        return np.stack([(first - moved) / n for n, moved in zip(nudges, there, strict=True)], -1)
+    def columns(self) -> Array:
+        """`[W, n, size]`, minus the derivatives of the residuals."""
+        first, *there = self._residuals([np.zeros(self.size), *STEP * np.eye(self.size)])
+        return np.stack([(first - moved) / STEP for moved in there], -1)
 
     def residual(self, x: Array, starts: Array) -> Array:
         """starts: `[W, 2 nv]`, further changes of the start states."""
-        return np.asarray(self._residuals(self.errors, [x], starts)[0])
+        return np.asarray(self._residuals([x], starts)[0])
 
-    def _residuals(self, errors: Errors, several: Iterable[Array], starts: Array | None = None) -> Array:
+    def _residuals(self, several: Iterable[Array], starts: Array | None = None) -> Array:
         """`[m, W, n]`."""
-        error = errors.run_each([self._case(x, starts) for x in several], self.factor)
+        error = self.errors.run_each([self._case(x, starts) for x in several], self.factor)
         return np.asarray(np.clip(error / self.sigma, -1e4, 1e4).reshape(*error.shape[:2], -1))
 
     def _case(self, x: Array, starts: Array | None) -> Case:
         shift, p, gains, loads = np.split(x, self.parts)
-        theta = np.maximum(self.nominal + p * self.span, self.least)  # beyond its range: nothing else may
-        cut = self.late(float(shift[0]))
+        # beyond its range, as nothing else may; positive ones stay so
+        grown = self.nominal * np.exp(np.divide(p * self.span, self.nominal, where=self.positive, out=np.zeros_like(p)))
+        theta = np.where(self.positive, grown, self.nominal + p * self.span)
+        cut = self.late(AROUND * float(shift[0]))
         command = np.asarray(cut.batch.command) * (1 + np.asarray(gains, np.float32))
         cut = dataclasses.replace(cut, batch=cut.batch.replace(command=command))
         force = np.einsum("fv,fwhv->whv", loads.reshape(4, -1), self.forces)
@@ -181,15 +162,17 @@ class _Model:
 def _shapes(cut: Windows) -> Array:
     """`[4, W, H, nv]`, of size 1 at most times: constant, with position, with speed, with the direction of motion.
 
-    Of measured motion, smoothed: the velocity of the logs, at the same rows.
+    Of measured motion, smoothed: the velocity of the logs, at the same rows. Directions are as sure as it is.
     """
     rows = [slice(int(a) + 1, int(a) + 1 + cut.steps) for a in cut.start]
     speed = np.stack([cut.logs[log].qvel[own] for log, own in zip(cut.log, rows, strict=True)])
+    noise = np.stack([cut.logs[log].sigma_qvel for log in cut.log])[:, None]
     typical = np.maximum(np.sqrt(np.mean(speed**2, (0, 1))), 1e-12)
     travel = np.cumsum(speed, axis=1) * cut.dt
     travel = travel - travel.mean(1, keepdims=True)
     reach = np.maximum(np.abs(travel).max((0, 1)), 1e-12)
-    return np.stack([np.ones_like(speed), travel / reach, speed / typical, np.tanh(speed / typical / RULES.direction)])
+    direction = np.tanh(speed / np.maximum(noise, 1e-12))
+    return np.stack([np.ones_like(speed), travel / reach, speed / typical, direction])
 
 
 def _judged(q: Quadratic, x: Array, precision: Array, cut: Windows, count: int) -> Shift:
@@ -200,18 +183,18 @@ def _judged(q: Quadratic, x: Array, precision: Array, cut: Windows, count: int) 
     seen = float(x[0] ** 2 / inverse[0, 0])
     left = max(float(q.c.sum()) - (count - len(x)), 0.0)
     error = float(np.sqrt(max(robust[0, 0], inverse[0, 0])))
+    apart = _apart(q, x, precision, cut)
     explains = seen / (seen + left) if seen > 0 else 0.0  # of logs without a gap, nothing
-    return Shift(float(x[0]), error, explains, _apart(q, x, precision, cut), seen / count, cut.dt)
+    return Shift(AROUND * float(x[0]), AROUND * error, AROUND * apart, explains, cut.dt)
 
 
 def _apart(q: Quadratic, x: Array, precision: Array, cut: Windows) -> float:
-    """How far the shift of a condition lies from that of all, with the other columns free, beyond two errors."""
+    """Standard deviation of the conditions' own shifts about that of all, as `Shift`, with the other columns free."""
     names = np.unique(cut.group)
     own = (cut.group[:, None] == names).astype(float)  # [W, G]
     cross = np.einsum("wg,wj->gj", own, q.S[:, 0, 1:])
     H = np.block([[np.diag(own.T @ q.S[:, 0, 0]), cross], [cross.T, q.S[:, 1:, 1:].sum(0) + np.diag(precision[1:])]])
     g = np.append(own.T @ q.g[:, 0], q.g[:, 1:].sum(0) - precision[1:] * x[1:])
     inverse = np.linalg.pinv(H, hermitian=True)
-    away = np.abs(inverse @ g)[: len(names)]
-    errors = np.sqrt(np.diag(inverse))[: len(names)]
-    return float(np.max(np.maximum(away - 2 * errors, 0.0)) / max(abs(x[0]), 1e-12))
+    away, errors = (inverse @ g)[: len(names)], np.diag(inverse)[: len(names)]
+    return float(np.sqrt(np.mean(np.maximum(away**2 - errors, 0.0))))
