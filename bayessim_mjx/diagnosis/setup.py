@@ -23,10 +23,10 @@ from bayessim_mjx.diagnosis.fitting import (
 )
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, at_most, finest, most_windows, windows_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from bayessim_mjx.diagnosis.fitting.quadratic import RULES
 from bayessim_mjx.diagnosis.fitting.robot import Robot, pruned
 from bayessim_mjx.diagnosis.fitting.simulable import contacts
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
-from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck import gate, noise
 from bayessim_mjx.diagnosis.request import Request
@@ -208,25 +208,21 @@ def _measured(
     use_qvel: bool,
     limit: Array | None,
     first: int = 1,
-    cheaper: Errors | None = None,
 ) -> tuple[Callable[..., Windows], discretisation.Discretisation]:
     """The windows, and what the time step is worth in them; shorter ones where contacts make longer ones a lottery.
 
     Args:
-        limit: `[nv]`, the tolerance: steps are made finer than the budget allows until they are worth less; None: they
-            are not.
+        limit: `[nv]`, the tolerance; None: none is known.
         first: the coarsest factor on the sub-steps that is stable: as many windows fewer are looked at.
-        cheaper: see `Errors`.
     """
-    for share in CUTTING.shorter:
-        cuts = windows_of(own, usable, group, use_qvel, share * CUTTING.window, first)
-        most, utmost = (finest(own, len(cuts(1)), cuts(1).steps, budget) for budget in (1.0, CUTTING.dearest))
-        step = discretisation.measure(own, cuts, usable, most, first=first, limit=limit, utmost=utmost, cheaper=cheaper)
-        known = np.isfinite(step.sigma)
-        worth = float(np.median(step.floor[known] / step.sigma[known]))
-        if worth < CUTTING.lottery or not contacts(own) or cuts(1).steps <= CUTTING.shortest_window:
-            break
-    return cuts, step
+    seconds = CUTTING.window
+    while True:
+        cuts = windows_of(own, usable, group, use_qvel, seconds, first)
+        steps = cuts(1).steps
+        step = discretisation.measure(own, cuts, usable, finest(own, len(cuts(1)), steps), first=first, limit=limit)
+        if not (contacts(own) and step.lottery) or steps == RULES.parts:
+            return cuts, step
+        seconds /= 2
 
 
 def _shift(

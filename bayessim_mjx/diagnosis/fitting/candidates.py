@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx import effects as library
+from bayessim_mjx.diagnosis.data_sheet import WORST
+from bayessim_mjx.diagnosis.fitting.quadratic import RULES
 from bayessim_mjx.diagnosis.fitting.scales import Scales, ranges
 from bayessim_mjx.effects.effect import Block, Effect, Quantity, in_order
 from bayessim_mjx.effects.support.quantity import STATED
@@ -21,10 +23,6 @@ from bayessim_mjx.physics import Physics
 
 Array = NDArray[np.float64]
 STEP = 0.005  # of the range: first finite differences, before `Fit.steps` knows the columns; not counted
-SPAN = 0.4  # of its value, as far as a number is taken to be off where a scale is needed; a rule of thumb
-# Standard deviations from a value whose accuracy is stated, beyond which nothing is that value: 1 in 16 000 of Gaussian
-# errors, a rule of thumb. Of what a motor's gain and all masses do alike, logs alone would let masses go anywhere.
-FARTHEST = 4.0
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ class Coordinate:
     @property
     def step(self) -> float:
         span = self.high - self.low
-        return STEP * (min(span, SPAN * abs(self.neutral)) if self.stated and self.neutral else span)
+        return STEP * (min(span, WORST * abs(self.neutral)) if self.stated and self.neutral else span)
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,8 @@ def base_coordinates(
             return replace(own, stated=True, kind=p.attribute)
         if p.name not in known or p.nominal == 0:
             return replace(own, stated=p.name in known)
-        far = FARTHEST * precision**-0.5
+        # what a motor's gain and all masses do alike, logs alone would let masses go anywhere
+        far = RULES.far * precision**-0.5
         return replace(own, stated=True, low=max(p.low, p.nominal - far), high=min(p.high, p.nominal + far))
 
     return tuple(coordinate(i, p) for i, p in enumerate(space.parameters))

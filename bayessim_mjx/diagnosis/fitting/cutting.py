@@ -6,34 +6,38 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from bayessim_mjx.diagnosis.fitting import windows
+from bayessim_mjx.diagnosis.fitting.quadratic import RULES
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Physics
 
 
 @dataclass(frozen=True)
 class Cutting:
-    """How logs are cut into windows, and how many are simulated. Choices between seconds and accuracy, not counted."""
+    """How logs are cut into windows, and how many are simulated. Choices between seconds and accuracy, not counted.
 
-    window: float = 0.5  # s
-    # of it, tried in turn while the time step with contacts is worth more than `lottery` noises
-    shorter: tuple[float, ...] = (1.0, 0.5, 0.25)
-    lottery: float = 5.0
-    shortest_window: int = 8  # control steps
-    longest_window: int = 100  # control steps, or as many as `long` s hold
-    long: float = 0.4  # s
-    shortest: float = 0.0005  # s, control period of the diagnosis; faster logs are resampled
-    limits: tuple[tuple[int, int], ...] = ((1, 160), (3, 96), (7, 64), (100, 48))  # (up to so many dofs, windows)
-    # sub-steps of one simulation of all windows; half of it for robots of more than `many` dofs
+    Attributes:
+        window: s; shorter where contacts make it a lottery (`Discretisation.lottery`).
+        limits: (up to so many dofs, windows).
+        budget: sub-steps of one simulation of all windows; half of it for robots of more than `many` dofs.
+        simulations: of all windows, that a whole search takes: where time is limited no finer integrator makes it take
+            longer.
+        fewest: windows that are simulated whatever the budget.
+        least: windows, with fewer nothing can be held out.
+    """
+
+    window: float = 0.5
+    limits: tuple[tuple[int, int], ...] = ((1, 160), (3, 96), (7, 64), (100, 48))
     budget: int = 24000
     many: int = 3
-    dearest: float = 4.0  # budgets, where the time step is worth more than the tolerance
-    # of all windows, that a whole search takes: where time is limited no finer integrator makes it take longer
     simulations: int = 2500
-    fewest: int = 24  # windows that are simulated whatever the budget
-    least: int = 6  # windows: with fewer nothing can be held out
+    fewest: int = 24
+    least: int = 6
+
+    @property
+    def shortest(self) -> float:
+        """s, control period, of which the fewest windows take the whole budget; faster logs are resampled."""
+        return self.window * self.fewest / self.budget
 
 
 CUTTING = Cutting()
@@ -57,8 +61,7 @@ def windows_of(
     """
     dt = physics.dt
     longest = max(int(log.duration / dt) for log in logs)
-    longest_window = max(CUTTING.longest_window, round(CUTTING.long / dt))
-    length = int(np.clip(round(seconds / dt), CUTTING.shortest_window, longest_window))
+    length = max(round(seconds / dt), RULES.parts)
     if longest < length:
         raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
     own = max(min(CUTTING.fewest, most_windows(physics, length)), most_windows(physics, length) // first)
@@ -101,6 +104,6 @@ def at_most(nv: int, quick: bool = False) -> int:
     return CUTTING.fewest if quick else next(n for dofs, n in CUTTING.limits if nv <= dofs)
 
 
-def finest(physics: Physics, count: int, length: int, share: float = 1.0) -> int:
-    """How many times the sub-steps `share` budgets allow when at most half of `count` windows are given up for it."""
-    return max(1, int(share * _budget(physics)) // (length * physics.substeps * max(CUTTING.fewest, (count + 1) // 2)))
+def finest(physics: Physics, count: int, length: int) -> int:
+    """How many times the sub-steps the budget allows when at most half of `count` windows are given up for it."""
+    return max(1, _budget(physics) // (length * physics.substeps * max(CUTTING.fewest, (count + 1) // 2)))

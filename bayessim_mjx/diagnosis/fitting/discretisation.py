@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +22,7 @@ from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.fitting.simulable import contacts
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
+from bayessim_mjx.diagnosis.gap import AT_NOISE
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics import Physics
@@ -28,23 +30,13 @@ from bayessim_mjx.physics import Physics
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Rules:
-    """How fine a time step is looked for, and when its error is known. Rules of thumb, not counted."""
-
-    factors: tuple[int, ...] = (1, 2, 4, 8)
-    more: tuple[int, ...] = (16, 32)  # beyond the budget, where the step is worth more than the tolerance
-    contacts: int = 4  # the finest with contacts: what is left falls with the root of the step at best
-    enough: float = 0.6  # noises: an error of the time step that needs no finer sub-steps
-    nats: float = 1.0  # by which it may move the evidence: half of the sum of its squares, in noises, over all rows
-    shorter: int = 5  # halvings of the time step that can be recommended
-    worth: float = 1.0  # noises: from here on the user is told
-    # errors that shrink by less from one sub-step to its half are not worth finer ones
-    converging: float = 1.3
-    sure: float = 0.4  # of what is taken for noise: below, the estimates themselves are too coarse
-
-
-RULES = Rules()
+FACTORS = (1, 2, 4)  # on the coarsest stable sub-steps: Richardson's method takes three; a search may take any of them
+# Noises up to which an error of the time step needs no finer sub-steps: beside it a model is at the noise. And share of
+# the error that the finest have to leave where none is as fine; with contacts it falls with the root of the step
+ENOUGH = float(np.sqrt(AT_NOISE**2 - 1))
+# Share of what is taken for noise that is the sensors': with less the estimates themselves are too coarse, and windows
+# with contacts are shortened. A rule of thumb, not counted
+BELIEVED = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +52,7 @@ class Discretisation:
         simulated: `[nv]`, channels that show no noise at all: logs of a simulation.
         channels: names `[nv]`.
         errors: the windows simulated without effects, for what else is asked of them.
-        rows: of all windows; limit: `[nv]`, the tolerance, rad or m; None: none is known.
+        limit: `[nv]`, the tolerance, rad or m; None: none is known.
     """
 
     timestep: float
@@ -75,7 +67,6 @@ class Discretisation:
     channels: tuple[str, ...]
     errors: Errors | None = None
     limit: Array | None = None
-    rows: int = 0
 
     def robot(self, robot: Robot) -> Robot:
         """The robot at the sub-steps of the diagnosis."""
@@ -90,32 +81,22 @@ class Discretisation:
         return dataclasses.replace(cut, sigma_q=self.floor[:nv], sigma_v=self.floor[nv:], spread=spread)
 
     @property
-    def sensed(self) -> NDArray[np.bool_]:
-        """`[2 nv]`, channels with noise of a sensor's."""
-        return np.asarray(np.isfinite(self.sigma) & ~np.tile(self.simulated, 2))
-
-    @property
     def believed(self) -> float:
-        """Share of what is taken for noise that is the sensors' (median over channels), at least SURE."""
-        own = self.sensed
-        return float(np.clip(np.median(self.sigma[own] / self.floor[own]), RULES.sure, 1.0)) if own.any() else 1.0
+        """Share of what is taken for noise that is the sensors' (median over channels), at least BELIEVED."""
+        own = np.isfinite(self.sigma) & ~np.tile(self.simulated, 2)
+        return max(float(np.median(self.sigma[own] / self.floor[own])), BELIEVED) if own.any() else 1.0
 
     @property
-    def shows(self) -> bool:
-        """Whether what the sub-steps leave moves the evidence; logs of a simulation may have this step."""
-        return self.nats > RULES.nats
-
-    @property
-    def nats(self) -> float:
-        """By which what the sub-steps leave may move the log likelihood: less than noise in a row, it adds up."""
-        own = self.sensed
-        return 0.5 * self.rows * float(np.sum((self.left[own] / self.sigma[own]) ** 2))
+    def lottery(self) -> bool:
+        """Whether contacts make these windows too long to tell anything."""
+        known = np.isfinite(self.sigma)
+        return bool(np.median(self.floor[known] / self.sigma[known]) >= 1 / BELIEVED)
 
     def warnings(self) -> list[str]:
         """In words, where the simulator's own time step is worth more than the noise."""
         nv = len(self.channels)
         noises = self.own[:nv] / self.sigma[:nv]
-        if noises.max() < RULES.worth:
+        if noises.max() < 1:
             return []
         at = int(np.argmax(noises))
         size = "" if self.simulated[at] else f"{noises[at]:.1f} noise standard deviations, "
@@ -126,9 +107,8 @@ class Discretisation:
         return [text + self._remedy(noises[at], bool(self.simulated[at]))]
 
     def _remedy(self, noises: float, simulated: bool) -> str:
-        halvings = int(np.ceil(np.log2(noises / RULES.worth)))
-        few = not simulated and halvings <= RULES.shorter
-        other = f"a step of {1e3 * self.timestep / 2**halvings:.2g} ms" if few else "a shorter step"
+        finer = 1e3 * self.timestep / 2 ** int(np.ceil(np.log2(noises)))
+        other = "a shorter step" if simulated else f"a step of {finer:.2g} ms"
         text = f"{other}, or the integrator RK4 where nothing is in contact, reduces it"
         if self.factor > 1:
             text += f"; the diagnosis simulates at {1e3 * self.timestep / self.factor:.3g} ms"
@@ -136,9 +116,7 @@ class Discretisation:
             return f"{text}; the logs show no noise, so everything smaller than this counts as noise"
         known = np.isfinite(self.sigma)
         left = np.sqrt(np.maximum((self.floor[known] / self.sigma[known]) ** 2 - 1, 0.0)).max()
-        return (
-            f"{text}; the rest, {left:.2g} noise standard deviations, counts as noise" if left > RULES.enough else text
-        )
+        return f"{text}; the rest, {left:.2g} noise standard deviations, counts as noise" if left > ENOUGH else text
 
     def beyond(self) -> list[str]:
         """In words, where no step that can be afforded is fine enough: to be told before anything is fitted."""
@@ -188,8 +166,6 @@ def measure(
     *,
     first: int = 1,
     limit: Array | None = None,
-    utmost: int | None = None,
-    cheaper: Errors | None = None,
 ) -> Discretisation:
     """The errors of `physics` (without effects) in the windows, and the sub-steps that the diagnosis should take.
 
@@ -198,31 +174,25 @@ def measure(
         logs: as recorded.
         most: the finest factor that can be afforded.
         first: the coarsest factor that is stable.
-        limit: `[nv]`, the tolerance, rad or m. utmost: the finest factor where the step is worth more than that.
-        cheaper: see `Errors`; left alone where its windows are others.
+        limit: `[nv]`, the tolerance, rad or m.
     """
-    start = cuts(first)
+    start, factors = cuts(first), [first * f for f in FACTORS]
     touching = contacts(physics)
     sigma = np.concatenate([start.sigma_q, start.sigma_v])
-    parts = [(own.log.tolist(), own.start.tolist(), own.steps) for own in (start, cheaper.cut if cheaper else start)]
-    errors = Errors(physics, start, 4 * first, cheaper if parts[0] == parts[1] else None)
+    errors = Errors(physics, start, factors[-1])
     errors.start(sigma)
-    coarse, mid, fine = (errors.run(cuts(first * f), first * f) for f in (1, 2, 4))
+    coarse, mid, fine = (errors.run(cuts(f), f) for f in factors)
     plain = errors.run(held(start), first, corrected=False)
     settle = errors.settler(sigma)
     one, two = settle(coarse - mid), settle(mid - fine)
     gain = _gain(one / sigma, two / sigma)
     truth = fine if touching else fine + (fine - mid) / max(gain - 1, 1.0)
     worth = _size(one, touching) * _all(gain, touching)
-    at = {first * f: worth / gain ** np.log2(f) for f in (*RULES.factors, *RULES.more)}
+    at = {f: worth / gain**k for k, f in enumerate(factors)}
     settled = _size(settle(plain - truth), touching)
-    clean = np.array([noise_free(logs, i) for i in physics.mj_model.jnt_qposadr[physics.mj_model.dof_jntid]])
+    clean = simulated(physics.mj_model, logs)
     base = np.hypot(sigma, np.tile(clean, 2) * settled)  # who simulated such logs may have used this step or another
-    most = max(first, min(most, RULES.contacts) if touching else most)
-    allowed = [first * f for f in RULES.factors if first * f <= most]
-    factor = _choose({f: float(np.max(at[f] / base)) for f in allowed}, gain, first)
-    if limit is not None and not touching and gain > RULES.converging:
-        factor = _within({f: float(np.max(x[: len(limit)] / limit)) for f, x in at.items()}, factor, utmost or factor)
+    factor = _choose({f: float(np.max(at[f] / base)) for f in factors if f <= max(first, most)})
     return Discretisation(
         timestep=float(physics.mj_model.opt.timestep),
         factor=factor,
@@ -236,8 +206,12 @@ def measure(
         channels=Channels.of(physics.mj_model).qvel,
         errors=errors,
         limit=limit,
-        rows=one.shape[0] * one.shape[1],
     )
+
+
+def simulated(model: mujoco.MjModel, logs: Sequence[Log]) -> NDArray[np.bool_]:
+    """`[nv]`, channels that show no noise at all."""
+    return np.array([noise_free(logs, i) for i in model.jnt_qposadr[model.dof_jntid]])
 
 
 def _gain(one: Array, two: Array) -> float:
@@ -252,24 +226,17 @@ def _all(gain: float, touching: bool) -> float:
     return float(1 / np.sqrt(1 - gain**-2.0)) if touching else gain / (gain - 1)
 
 
-def _choose(error: dict[int, float], gain: float, first: int = 1) -> int:
-    """The coarsest factor that is fine enough; where none is, the finest, if finer ones gain anything."""
-    enough = [f for f, e in error.items() if e < RULES.enough]
-    return min(enough) if enough else max(error) if gain > RULES.converging else first
-
-
-def _within(error: dict[int, float], factor: int, utmost: int) -> int:
-    """`factor`, or where its error is more than the tolerance the coarsest one up to `utmost` whose error is not."""
-    if error[factor] <= 1:
-        return factor
-    finer = [f for f in sorted(error) if factor < f <= utmost]
-    return next((f for f in finer if error[f] <= 1), finer[-1] if finer else factor)
+def _choose(error: dict[int, float]) -> int:
+    """The coarsest factor that is fine enough; where none is, the finest, if that gains anything."""
+    coarsest, finest = min(error), max(error)
+    enough = [f for f, e in error.items() if e < ENOUGH]
+    return min(enough) if enough else finest if error[finest] < ENOUGH * error[coarsest] else coarsest
 
 
 def _excess(error: Array, noise: Array) -> Array:
     """Squares of errors beyond what does not show."""
     known = np.isfinite(noise)
-    return np.maximum(error**2 - np.square(RULES.enough * noise, where=known, out=np.zeros_like(noise)), 0.0)
+    return np.maximum(error**2 - np.square(ENOUGH * noise, where=known, out=np.zeros_like(noise)), 0.0)
 
 
 def _size(error: Array, touching: bool) -> Array:

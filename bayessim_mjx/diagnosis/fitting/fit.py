@@ -10,12 +10,9 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.data_sheet import SURE
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
-from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Starts, eliminate
+from bayessim_mjx.diagnosis.fitting.quadratic import RULES, Quadratic, Starts, eliminate
 
 Array = NDArray[np.float64]
-# noise sd, rms by which a finite difference changes the residuals: rounding is 2e-4 to 6e-4; one noise was too far
-# where friction of the model's own is fitted beside a law of friction (their sum came 8 % too large)
-CHANGE = 0.3
 REACH = 16.0  # by which its step may be longer or shorter than the first one (`candidates.STEP`); not counted
 
 
@@ -27,7 +24,7 @@ class Fit:
         coordinates: free ones; values: `[k]`; offsets: `[W, s]` of the start states.
         r: whitened residuals `[W, n]`; A: `[W, n, k]`, minus their derivatives; B: `[W, n, s]` by the start states.
         weight: `[W]`; cost: weighted, priors included; damping: Levenberg's, of the next
-            step; the first one is a rule of thumb.
+            step.
         promise: by how much the next step would lower the cost if the model were linear; history: costs, step by step.
         doubt: squared misfit per independent number in the data, by which priors of stated parameters are multiplied.
         reach: `[W]`, share of their own steps that the start states make: less after one that did a window harm.
@@ -42,7 +39,7 @@ class Fit:
     B: Array
     weight: Array
     cost: float
-    damping: float = 1e-3
+    damping: float = RULES.trust
     promise: float = np.inf
     history: tuple[float, ...] = ()
     doubt: float = 1.0
@@ -59,7 +56,7 @@ class Fit:
         return np.array([c.step for c in self.coordinates])
 
     def steps(self) -> Array:
-        """Of the columns' finite differences `[k]`: as long as changes the motion by `CHANGE`, going by the last ones.
+        """Of the columns' finite differences `[k]`: of a motion changed by `RULES.change`, going by the last ones.
 
         Numbers that do the same to the motion then have the same columns, but for a factor. A secant's own error (its
         second order, where friction sticks) would else tell them apart.
@@ -68,7 +65,7 @@ class Fit:
         if self.A.shape != (*self.r.shape, len(own)):
             return own
         size = np.sqrt(np.mean(self.A**2, axis=(0, 1)))
-        return np.clip(np.divide(CHANGE, size, where=size > 0, out=own.copy()), own / REACH, own * REACH)
+        return np.clip(np.divide(RULES.change, size, where=size > 0, out=own.copy()), own / REACH, own * REACH)
 
     def inward(self, values: Array, steps: Array) -> Array:
         """Steps down where ranges end above."""

@@ -76,7 +76,7 @@ class Fitter:
     def start_columns(self, theta: Array, offsets: Array, r: Array) -> Array:
         """B `[W, n, s]` at theta."""
         s = offsets.shape[1]
-        h = quadratic.START_STEP * self.spread
+        h = quadratic.RULES.change * self.spread
         moved = offsets[None] + (np.eye(s) * h)[:, None, :]
         shifted = self.whiten(self.simulator.run(np.repeat(theta[None], s, 0), moved))
         return np.ascontiguousarray(np.moveaxis((r[None] - shifted) / h[:, None, None], 0, -1))

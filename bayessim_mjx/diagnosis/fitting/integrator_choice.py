@@ -1,6 +1,9 @@
-"""The integrator and the time step of a diagnosis: the coarsest stable step, and RK4 where sub-steps do not suffice.
+"""The integrator and the time step of a diagnosis: the coarsest stable step, and RK4 where nothing can touch.
 
-Stability is that of the model linearised by MuJoCo at states of the logs, without contacts and limits: the solver keeps
+What no sub-steps of a first-order integrator remove would count as noise, and in a noise that is larger than the
+sensors' what two integrators differ by (a fraction of a millisecond, usually) is found as an effect.
+
+Stability is that of MuJoCo's own step, linearised at states of the logs, without contacts and limits: the solver keeps
 those stable by itself. Stiff springs, servo loops and nearly massless axes need fine steps.
 """
 
@@ -12,38 +15,24 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation
+from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
+from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, simulated
+from bayessim_mjx.diagnosis.fitting.observation import Stepper
 from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.fitting.scales import mass_matrix
 from bayessim_mjx.diagnosis.fitting.simulable import contacts
 from bayessim_mjx.logs.log import Channels, Log
-from bayessim_mjx.physics import controllers
-from bayessim_mjx.physics.timestep import STAGES
 
 Array = NDArray[np.float64]
-# (robot's physics, first=coarsest stable factor, cheaper=see `Errors`) -> (the windows, the error of the time step)
+# (robot's physics, first=coarsest stable factor) -> (the windows, the error of the time step)
 Measured = Callable[..., tuple[Any, Discretisation]]
 TOO_LONG = "the model's time step shows beside the noise, and in the time given nothing finer can be searched with"
-EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST"))
-
-
-@dataclass(frozen=True)
-class Rules:
-    """When a step is stable, and how fine one is looked for. Rules of thumb, not counted."""
-
-    finest: int = 64  # sub-steps per step of the model
-    states: int = 8  # of all logs, at which the model is linearised
-    nudge: float = 1e-5  # rad or rad/s, of the finite differences
-    growth: float = 1.05  # per step, beyond what the motion itself grows by (a pendulum that falls over)
-
-
-RULES = Rules()
+RK4, IMPLICITFAST = int(mujoco.mjtIntegrator.mjINT_RK4), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+NAMES = {RK4: "RK4", IMPLICITFAST: "implicitfast"}
+FINEST = 64  # sub-steps per step of the model that are tried; a rule of thumb
 
 
 @dataclass(frozen=True)
@@ -69,7 +58,9 @@ class Step:
         """The robot with the integrator."""
         if not self.changed:
             return robot
-        return _integrated(robot, self.integrator)
+        model = copy.copy(robot.mj_model)
+        model.opt.integrator = self.integrator
+        return dataclasses.replace(robot, mj_model=model)
 
     def sentences(self) -> list[str]:
         """Sentences for the user before anything is fitted."""
@@ -82,20 +73,23 @@ class Step:
         if not self.reached:
             mend = "more armature or damping, or a softer loop, at this joint would"
             return [f"{text}, and for {finer:.3g} ms too; no gap can be trusted there ({mend})"]
-        how = " by the integrator implicitfast" if self.changed else ""
+        how = f" by the integrator {NAMES[self.integrator]}" if self.changed else ""
         return [f"{text}; the diagnosis simulates at {finer:.3g} ms or less{how}"]
 
 
-def coarsest_stable(model: mujoco.MjModel, logs: Sequence[Log]) -> Step:
-    """The coarsest stable step of a model, with its own integrator, or with implicitfast where that may be coarser."""
+def coarsest_stable(model: mujoco.MjModel, logs: Sequence[Log], precise: bool = False) -> Step:
+    """The coarsest stable step of a model, with its own integrator, or with implicitfast where that may be coarser.
+
+    Args:
+        precise: RK4 goes before both.
+    """
     own, h = int(model.opt.integrator), float(model.opt.timestep)
-    cases = list(_linearised(model, logs))
-    kinds = [own] + [IMPLICITFAST] * (own != IMPLICITFAST)
-    factors = {kind: max((_factor(case, kind, h) for case in cases), default=1) for kind in kinds}
-    best = min(kinds, key=lambda kind: (factors[kind], kind != own))
-    factor = factors[best]
-    joint = "" if factors[own] == 1 else _joint(model, cases, own, h)
-    return Step(h, min(factor, RULES.finest), best, best != own, joint, factor <= RULES.finest)
+    kinds = dict.fromkeys([RK4] * precise + [own, IMPLICITFAST])
+    cases = {kind: list(_cases(model, logs, kind)) for kind in kinds}
+    factors = {kind: max((case.factor(h) for case in cases[kind]), default=1) for kind in kinds}
+    best = min(kinds, key=lambda kind: factors[kind])
+    joint = "" if factors[own] == 1 else _joint(model, cases[own], h)
+    return Step(h, min(factors[best], FINEST), best, best != own, joint, factors[best] <= FINEST)
 
 
 @dataclass(frozen=True)
@@ -105,7 +99,7 @@ class Choice:
     Attributes:
         robot: with the integrator of the diagnosis; stable: its coarsest stable step.
         cuts, worth: the windows, and the error of the time step in them.
-        better: told where the integrator was changed for its accuracy.
+        better: told of an integrator that is more accurate than the model's.
     """
 
     robot: Robot
@@ -123,137 +117,82 @@ class Choice:
         return self.worth.warnings() if self.stable.factor == 1 else []
 
 
-def choose(
-    robot: Robot,
-    dt: float,
-    logs: Sequence[Log],
-    measured: Measured,
-    left: float = np.inf,
-) -> Choice:
-    """The coarsest stable step; where what no sub-steps remove shows, and nothing can touch, RK4.
+def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, left: float = np.inf) -> Choice:
+    """The coarsest stable step; by RK4 where nothing can touch, the logs have noise and there is time.
 
-    It would count as noise else, and in a noise that is larger than the sensors' what two integrators differ by (a
-    fraction of a millisecond, usually) is found as an effect.
+    Logs of a simulation may have been made by the model's own integrator.
 
     Args:
         left: s that one simulation of all windows may take, for the search to end in time.
     """
-    stable = coarsest_stable(robot.physics(dt).mj_model, logs)
-    robot = stable.robot(robot)
     own = robot.physics(dt)
-    plain = Choice(robot, stable, *measured(own, first=stable.factor))
-    if not (plain.worth.beyond() or plain.worth.shows):
-        return plain
-    if contacts(own) or int(own.mj_model.opt.integrator) == RK4:
-        return plain
-    if plain.worth.errors and (len(STAGES) + 1) * plain.worth.errors.seconds >= left:
-        return dataclasses.replace(plain, better=(TOO_LONG,))
-    other = _integrated(robot, RK4)
-    physics = other.physics(dt)
-    needs = coarsest_stable(physics.mj_model, logs)
-    if needs.changed or not needs.reached:
-        return plain
-    found = measured(physics, first=needs.factor, cheaper=plain.worth.errors)
-    if found[1].nats > plain.worth.nats:
-        return plain
-    step = 1e3 * found[1].timestep / found[1].factor
-    text = f"the diagnosis simulates by RK4 at {step:.3g} ms: sub-steps of the model's integrator show in the evidence"
-    return Choice(other, dataclasses.replace(needs, joint=stable.joint), *found, better=(text,))
-
-
-def _integrated(robot: Robot, integrator: int) -> Robot:
-    model = copy.copy(robot.mj_model)
-    model.opt.integrator = integrator
-    return dataclasses.replace(robot, mj_model=model)
+    precise = not contacts(own) and not simulated(own.mj_model, logs).all()
+    stable = coarsest_stable(own.mj_model, logs, precise)
+    better = stable.robot(robot)
+    cuts, worth = measured(better.physics(dt), first=stable.factor)
+    if not stable.changed or stable.integrator != RK4:
+        return Choice(better, stable, cuts, worth)
+    if worth.errors and worth.errors.seconds >= left:
+        stable = coarsest_stable(own.mj_model, logs)
+        robot = stable.robot(robot)
+        return Choice(robot, stable, *measured(robot.physics(dt), first=stable.factor), better=(TOO_LONG,))
+    step = 1e3 * worth.timestep / worth.factor
+    text = f"the diagnosis simulates by RK4 at {step:.3g} ms: errors of the model's integrator could pass for effects"
+    return Choice(better, stable, cuts, worth, better=(text,))
 
 
 @dataclass(frozen=True)
-class _Linear:
-    """Accelerations per position and per velocity `[nv, nv]`; of the latter what each integrator treats implicitly."""
+class _Case:
+    """A state in a log, in which nothing touches: how steps of an integrator grow there; grows: 1/s, the motion."""
 
-    position: Array
-    velocity: Array
-    implicit: dict[int, NDArray[np.floating]]
+    stepper: Stepper
+    qpos: Array
+    qvel: Array
+    row: int
+    grows: float
 
-    def stepped(self, kind: int, h: float) -> Array:
-        """One step of h s: (q, v) -> (q, v), `[2 nv, 2 nv]`."""
-        n = len(self.position)
-        one, nothing = np.eye(n), np.zeros((n, n))
-        if kind == RK4:
-            A = h * np.block([[nothing, one], [self.position, self.velocity]])
-            return np.asarray(
-                np.eye(2 * n) + A @ (np.eye(2 * n) + A @ (np.eye(2 * n) + A @ (np.eye(2 * n) + A / 4) / 3) / 2)
-            )
-        explicit = self.velocity - self.implicit[kind]
-        inverse = np.linalg.inv(one - h * self.implicit[kind])
-        speed = np.hstack([h * inverse @ self.position, inverse @ (one + h * explicit)])
-        return np.vstack([np.hstack([one, nothing]) + h * speed, speed])
+    def step(self, h: float) -> Array:
+        """One step of h s, linearised: `[2 nv, 2 nv]`."""
+        self.stepper.reset()
+        return self.stepper.linearised(self.qpos, self.qvel, self.row, h)[2]
 
-    def grows(self) -> float:
-        """1/s, by which the motion itself grows."""
-        n = len(self.position)
-        A = np.block([[np.zeros((n, n)), np.eye(n)], [self.position, self.velocity]])
-        return max(float(np.linalg.eigvals(A).real.max()), 0.0)
-
-    def stable(self, kind: int, h: float) -> bool:
-        G = self.stepped(kind, h)
-        return bool(np.isfinite(G).all()) and _radius(G) < RULES.growth * np.exp(min(self.grows() * h, 50.0))
+    def factor(self, h: float) -> int:
+        """The power of two by which h has to be divided for errors to grow by e in a window at most, or 2 FINEST."""
+        factor = 1
+        while factor <= FINEST and not _radius(self.step(h / factor)) < np.exp(
+            (self.grows + 1 / CUTTING.window) * h / factor
+        ):
+            factor *= 2
+        return factor
 
 
 def _radius(G: Array) -> float:
-    return float(np.abs(np.linalg.eigvals(G)).max())
+    return float(np.abs(np.linalg.eigvals(G)).max()) if np.isfinite(G).all() else np.inf
 
 
-def _factor(case: _Linear, kind: int, h: float) -> int:
-    factor = 1
-    while factor <= RULES.finest and not case.stable(kind, h / factor):
-        factor *= 2
-    return factor
-
-
-def _joint(model: mujoco.MjModel, cases: Sequence[_Linear], kind: int, h: float) -> str:
+def _joint(model: mujoco.MjModel, cases: Sequence[_Case], h: float) -> str:
     """The dof that moves most in the mode that grows fastest."""
-    worst = max((case.stepped(kind, h) for case in cases), key=_radius)
+    worst = max((case.step(h) for case in cases), key=_radius)
     values, modes = np.linalg.eig(worst)
     mode = np.abs(modes[model.nv :, int(np.argmax(np.abs(values)))])
     return Channels.of(model).qvel[int(np.argmax(mode))]
 
 
-def _linearised(model: mujoco.MjModel, logs: Sequence[Log]) -> Iterator[_Linear]:
-    laws = controllers.of_logs(logs, model)
-    each = max(1, RULES.states // max(len(logs), 1))
-    for i, log in list(enumerate(logs))[: RULES.states]:
-        law = None if laws is None else jax.tree.map(lambda x, i=i: np.asarray(x[i]), laws)
+def _cases(model: mujoco.MjModel, logs: Sequence[Log], integrator: int) -> Iterator[_Case]:
+    """As many states of the logs as there are windows at least."""
+    model = copy.copy(model)
+    model.opt.integrator = integrator
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    each = max(1, CUTTING.fewest // max(len(logs), 1))
+    for log in logs[: CUTTING.fewest]:
+        stepper = Stepper(model, log)
         for row in np.linspace(0, len(log) - 1, each + 2).astype(int)[1:-1]:
-            yield _at(model, log.qpos[row], log.qvel[row], log.ctrl[row], law)
+            at = log.qpos[row], log.qvel[row], int(row)
+            yield _Case(stepper, *at, _growth(stepper.accelerations(*at)))
 
 
-def _at(model: mujoco.MjModel, qpos: Array, qvel: Array, command: Array, law: controllers.Law | None) -> _Linear:
-    data, nv = mujoco.MjData(model), model.nv
-
-    def forward(dq: Array, dv: Array, looped: bool = True) -> tuple[Array, Array]:
-        """(acceleration without constraints, passive and actuators' forces) at a nudged state."""
-        data.qpos[:], data.qvel[:] = qpos, qvel
-        mujoco.mj_integratePos(model, data.qpos, dq, 1.0)
-        data.qvel += dv
-        seen = (data.qpos, data.qvel) if looped else (qpos, qvel)
-        data.ctrl[:] = command if law is None else np.asarray(law(jnp.asarray(command), *map(jnp.array, seen)))
-        mujoco.mj_forward(model, data)
-        return data.qacc_smooth.copy(), data.qfrc_passive + data.qfrc_actuator
-
-    def columns(wrt: int, looped: bool, what: int) -> Array:
-        found = []
-        for d in RULES.nudge * np.eye(nv):
-            ends = [(s * d, 0 * d) if wrt == 0 else (0 * d, s * d) for s in (1, -1)]
-            a, b = (forward(*end, looped)[what] for end in ends)
-            found.append((a - b) / (2 * RULES.nudge))
-        return np.stack(found, 1)
-
-    position, velocity = columns(0, True, 0), columns(1, True, 0)
-    forces = columns(1, False, 1)
-    forward(np.zeros(nv), np.zeros(nv))
-    inertia = mass_matrix(model, data)
-    damped = not int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-    of_euler = -np.diag(model.dof_damping) if damped else np.zeros((nv, nv))
-    implicit = {EULER: np.linalg.solve(inertia, of_euler), IMPLICITFAST: np.linalg.solve(inertia, forces)}
-    return _Linear(position, velocity, implicit)
+def _growth(accelerations: Array) -> float:
+    """1/s, by which motion grows, of accelerations by positions and velocities `[nv, 2 nv]`."""
+    n = len(accelerations)
+    A = np.vstack([np.eye(n, 2 * n, n), accelerations])
+    return max(float(np.linalg.eigvals(A).real.max()), 0.0)

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
 from bayessim_mjx.diagnosis.fitting.scales import mass_matrix
 from bayessim_mjx.diagnosis.logcheck.drives import DeclaredLaw
 from bayessim_mjx.errors import UserError
@@ -24,38 +25,14 @@ from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
-# rad or m, rad/s or m/s, of the finite differences: as usual with MuJoCo's own (mjd_transitionFD). Rounding of doubles
-# costs about 1e-10 then; what is lost where a contact begins was not measured.
-NUDGE = 1e-6
-
-
-@dataclass(frozen=True)
-class Rules:
-    """What is believed before anything is measured, and what counts as told. Rules of thumb.
-
-    How often their starts and standard deviations are right was not counted; one arm with friction at a joint without
-    an encoder is (tests/diagnosis/test_partial.py).
-
-    Attributes:
-        angle: rad or m, standard deviation of a position at a log's first row; speed: rad/s or m/s, of a velocity.
-        shares: of typical accelerations, that the model may lack; the most likely one of each log is taken.
-        passes: smoothed start states are filtered from again.
-        second: s, in which a start state has to show; known: of its standard deviation that may be left after that.
-        most: share of the logs, from which on all of them is filtered.
-        least: rad, rad/s, as precise as the model is taken to be.
-    """
-
-    angle: float = 0.5
-    speed: float = 2.0
-    shares: tuple[float, ...] = (0.003, 0.03, 0.3)
-    passes: int = 2
-    second: float = 0.5
-    known: float = 0.5
-    most: float = 0.8
-    least: float = 1e-6
-
-
-RULES = Rules()
+# rad or m, rad/s or m/s, of finite differences in doubles: the cube root of their precision balances the rounding of
+# central ones with their third order. No state is known better
+NUDGE = float(np.finfo(float).eps ** (1 / 3))
+SIZES = (
+    0.3,
+    0.03,
+    0.003,
+)  # of typical accelerations, that the model may lack: the most likely one is taken. Not counted
 
 
 def shortened(logs: Sequence[Log], seconds: float) -> tuple[tuple[Log, ...], list[str]]:
@@ -68,7 +45,7 @@ def shortened(logs: Sequence[Log], seconds: float) -> tuple[tuple[Log, ...], lis
     out, left = [], []
     for log in logs:
         stop = int(np.searchsorted(log.time, log.time[0] + share * log.duration, side="right"))
-        short = share < RULES.most and bool(log.lost)
+        short = share < 1 and bool(log.lost)
         out.append(log.cut(0, stop) if short else log)
         left += [f"{log.name} the first {out[-1].duration:.3g} of {log.duration:.3g} s"] if short else []
     if not left:
@@ -97,7 +74,7 @@ def completed(logs: Sequence[Log], model: mujoco.MjModel) -> tuple[Log, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """A smoothed motion: qpos `[T, nq]`, qvel `[T, nv]`, sd `[T, 2 nv]` and `known [2 nv]`, see `_left`."""
+    """A smoothed motion: qpos `[T, nq]`, qvel `[T, nv]`, sd `[T, 2 nv]` and `known [2 nv]`, see `_gained`."""
 
     qpos: Array
     qvel: Array
@@ -126,7 +103,7 @@ def _smoothed(log: Log, model: mujoco.MjModel) -> Way:
     stepper = Stepper(model, log)
     measured = _Measured.of(log)
     lacking = _accelerations(model, log)
-    tried = [_Filter(stepper, log, measured, share * lacking) for share in RULES.shares]
+    tried = [_Filter(stepper, log, measured, share * lacking) for share in SIZES]
     return max(tried, key=lambda f: np.nan_to_num(f.likelihood, nan=-np.inf)).smoothed()
 
 
@@ -154,7 +131,7 @@ class _Measured:
     @classmethod
     def of(cls, log: Log) -> _Measured:
         seen = np.concatenate([log.seen_dofs, log.seen_speeds])
-        noise = np.maximum(np.concatenate([log.sigma_dofs, log.sigma_qvel]), RULES.least)
+        noise = np.maximum(np.concatenate([log.sigma_dofs, log.sigma_qvel]), NUDGE)
         return cls(np.flatnonzero(seen), noise[seen])
 
 
@@ -169,19 +146,16 @@ class _Filter:
         self.stepper, self.log, self.measured, self.lacking = stepper, log, measured, lacking
         nv = stepper.nv
         seen = np.concatenate([log.seen_dofs, log.seen_dofs | log.seen_speeds])
-        noise = np.concatenate([log.sigma_dofs, np.maximum(log.sigma_qvel, RULES.least)])
-        wide = np.repeat([RULES.angle, RULES.speed], nv)
-        self.prior = np.where(seen, np.minimum(3 * np.maximum(noise, RULES.least), wide), wide)
-        start = log.qpos[0], np.where(seen[nv:], log.qvel[0], 0.0)
-        for _ in range(RULES.passes):
-            self._run(*start)
-            qpos, qvel, _ = self._back()
-            start = qpos[0], qvel[0]
+        noise = np.maximum(np.concatenate([log.sigma_dofs, log.sigma_qvel]), NUDGE)
+        self.prior = np.where(seen, np.minimum(3 * noise, _prior(nv)), _prior(nv))
+        self._run(log.qpos[0], np.where(seen[nv:], log.qvel[0], 0.0))
+        qpos, qvel, _ = self._back()
+        self._run(qpos[0], qvel[0])  # from the smoothed start: it is linearised there
 
     def smoothed(self) -> Way:
         qpos, qvel, spread = self._back()
         sd = np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0))
-        return Way(qpos, qvel, sd, _left(self.ways, self.measured, self.log.period))
+        return Way(qpos, qvel, sd, _gained(self.ways, self.measured, self.log.period))
 
     def _run(self, qpos: Array, qvel: Array) -> None:
         log, stepper, nv = self.log, self.stepper, self.stepper.nv
@@ -196,7 +170,7 @@ class _Filter:
                 dt = float(log.time[k] - log.time[k - 1])
                 qpos, qvel, way = stepper.linearised(qpos, qvel, k - 1)
                 push = np.concatenate([0.5 * dt**2 * np.diag(self.lacking), dt * np.diag(self.lacking)])
-                spread = way @ spread @ way.T + push @ push.T + RULES.least**2 * np.eye(2 * nv)
+                spread = way @ spread @ way.T + push @ push.T + NUDGE**2 * np.eye(2 * nv)
                 ways.append(way)
             predicted.append((qpos, qvel, spread))
             gap = stepper.difference(qpos, qvel, log.qpos[k], log.qvel[k])[rows]
@@ -223,20 +197,25 @@ class _Filter:
         return np.stack(positions), np.stack(velocities), np.stack(spreads)
 
 
-def _left(ways: Sequence[Array], measured: _Measured, period: float) -> Array:
-    """`[2 nv]`, share of a start state's standard deviation that is left after a window without unknown forces."""
+def _prior(nv: int) -> Array:
+    """Standard deviations `[2 nv]` of a log's first state: a radian or metre, and as much in a window."""
+    return np.repeat([1.0, 1 / CUTTING.window], nv)
+
+
+def _gained(ways: Sequence[Array], measured: _Measured, period: float) -> Array:
+    """`[2 nv]`, what a window without unknown forces tells of its start state, in what was known before."""
     size = len(ways[0])
-    prior = np.repeat([RULES.angle, RULES.speed], size // 2)
-    length = int(np.clip(round(RULES.second / period), 2, len(ways)))
-    left = []
+    prior = _prior(size // 2)
+    length = int(np.clip(round(CUTTING.window / period), 2, len(ways)))
+    gained = []
     for first in np.linspace(0, len(ways) - length, 5).astype(int):
         way, information = np.eye(size), np.diag(prior**-2.0)
         for A in ways[first : first + length]:
             seen = way[measured.rows] / measured.sigma[:, None]
             information = information + seen.T @ seen
             way = A @ way
-        left.append(np.sqrt(np.diag(np.linalg.inv(information))) / prior)
-    return np.asarray(np.min(left, axis=0))
+        gained.append(prior**2 / np.diag(np.linalg.inv(information)) - 1)
+    return np.asarray(np.max(gained, axis=0))
 
 
 def _demand_axial(logs: Sequence[Log]) -> None:
@@ -266,8 +245,8 @@ def _demand(ways: Sequence[tuple[Log, Way]], model: mujoco.MjModel) -> None:
     """
     log = ways[0][0]
     nv = model.nv
-    known = np.min([way.known for _, way in ways], axis=0)
-    names = [n for i, n in enumerate(log.channels.qvel) if known[nv + i] > RULES.known]
+    known = np.max([way.known for _, way in ways], axis=0)
+    names = [n for i, n in enumerate(log.channels.qvel) if known[nv + i] < 1]  # less than was known before
     if names:
         given = [f"qpos:{n}" for n in log.channels.qpos if f"qpos:{n}" not in log.absent]
         given += [f"qvel:{n}" for n, s in zip(log.channels.qvel, log.seen_speeds, strict=True) if s]
@@ -295,33 +274,49 @@ class Stepper:
         """Actuators without a past."""
         mujoco.mj_resetData(self.model, self.data)
 
-    def advanced(self, qpos: Array, qvel: Array, row: int) -> tuple[Array, Array]:
-        """The state at the next row."""
-        data, span = self.data, float(self.log.time[row + 1] - self.log.time[row])
+    def advanced(self, qpos: Array, qvel: Array, row: int, span: float | None = None) -> tuple[Array, Array]:
+        """The state at the next row, or `span` s later."""
+        span = float(self.log.time[row + 1] - self.log.time[row]) if span is None else span
         steps = max(1, int(np.ceil(span / self.longest - 1e-6)))
         self.model.opt.timestep = span / steps
-        command = self.log.ctrl[row]
+        command = self._at(qpos, qvel, row)
+        for _ in range(steps):
+            if self.loop is not None:
+                self.data.ctrl[:] = self.loop(command, self.data.qpos, self.data.qvel)
+            mujoco.mj_step(self.model, self.data)
+        return self.data.qpos.copy(), self.data.qvel.copy()
+
+    def _at(self, qpos: Array, qvel: Array, row: int) -> Array:
+        """The command of a row; data in that state."""
+        data, command = self.data, self.log.ctrl[row]
         if self.log.linear:
             command = 0.5 * (command + self.log.ctrl[row + 1])
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos, qvel, 0.0
-        data.ctrl[:] = command
-        for _ in range(steps):
-            if self.loop is not None:
-                data.ctrl[:] = self.loop(command, data.qpos, data.qvel)
-            mujoco.mj_step(self.model, data)
-        return data.qpos.copy(), data.qvel.copy()
+        data.ctrl[:] = command if self.loop is None else self.loop(command, data.qpos, data.qvel)
+        return np.asarray(command)
 
-    def linearised(self, qpos: Array, qvel: Array, row: int) -> tuple[Array, Array, Array]:
-        """(qpos, qvel) at the next row, and their derivatives by the state `[2 nv, 2 nv]`."""
+    def linearised(self, qpos: Array, qvel: Array, row: int, span: float | None = None) -> tuple[Array, Array, Array]:
+        """`advanced`, and its derivatives by the state `[2 nv, 2 nv]`."""
         before = self.data.act.copy()
-        ends = self.advanced(qpos, qvel, row)
+        ends = self.advanced(qpos, qvel, row, span)
         after = self.data.act.copy()
         way = np.empty((2 * self.nv, 2 * self.nv))
         for i, nudge in enumerate(NUDGE * np.eye(2 * self.nv)):
             self.data.act[:] = before
-            way[:, i] = self.difference(*ends, *self.advanced(*self.moved(qpos, qvel, nudge), row)) / NUDGE
+            way[:, i] = self.difference(*ends, *self.advanced(*self.moved(qpos, qvel, nudge), row, span)) / NUDGE
         self.data.act[:] = after
         return *ends, way
+
+    def accelerations(self, qpos: Array, qvel: Array, row: int) -> Array:
+        """Derivatives of the accelerations by the state `[nv, 2 nv]`."""
+
+        def at(nudge: Array) -> Array:
+            self._at(*self.moved(qpos, qvel, nudge), row)
+            mujoco.mj_forward(self.model, self.data)
+            return np.array(self.data.qacc)
+
+        nudges = NUDGE * np.eye(2 * self.nv)
+        return np.stack([(at(n) - at(-n)) / (2 * NUDGE) for n in nudges], 1)
 
     def moved(self, qpos: Array, qvel: Array, change: Array) -> tuple[Array, Array]:
         there = np.array(qpos)

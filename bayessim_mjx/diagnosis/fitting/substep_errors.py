@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx import programs
 from bayessim_mjx.device import on_cores
-from bayessim_mjx.diagnosis.fitting.quadratic import START_STEP, eliminate
+from bayessim_mjx.diagnosis.fitting.quadratic import RULES, eliminate
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
 from bayessim_mjx.physics import Drive, Physics, begin, staggered, substep
 from bayessim_mjx.physics.tangent import difference, integrate
@@ -23,16 +23,8 @@ from bayessim_mjx.physics.tangent import difference, integrate
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """How sub-steps are compared. Rules of thumb, not counted."""
-
-    starts: int = 5  # Newton steps of the start states, at most
-    falls: float = 0.99  # of the misfit that a step leaves: with more they are at their end
-    nudge: float = 0.0001  # rad or rad/s, at least, of the start states for their finite differences
-
-
-SIZES = Sizes()
+# rad or rad/s, at least, of finite differences of single precision: the square root of its rounding
+NUDGE = float(np.sqrt(np.finfo(np.float32).eps))
 
 
 def held(cut: Windows) -> Windows:
@@ -65,16 +57,13 @@ class Errors:
 
     Args:
         cut: the windows, with commands for the coarsest sub-steps that are asked for; finest: the largest factor.
-        cheaper: the same windows by an integrator that costs less, with their start states fitted: derivatives are
-            taken there, and start states begin there.
     """
 
-    def __init__(self, physics: Physics, cut: Windows, finest: int, cheaper: Errors | None = None) -> None:
-        self.physics, self.cut, self.finest, self.cheaper = physics, cut, finest, cheaper
+    def __init__(self, physics: Physics, cut: Windows, finest: int) -> None:
+        self.physics, self.cut, self.finest = physics, cut, finest
         self.first = cut.batch.command.shape[2] // physics.substeps
         self.theta = np.asarray(physics.space.nominal, np.float32)
-        nothing = np.zeros((len(cut), 2 * physics.mj_model.nv))
-        self.offsets: Array = nothing if cheaper is None else cheaper.offsets  # of the measured start states
+        self.offsets: Array = np.zeros((len(cut), 2 * physics.mj_model.nv))  # of the measured start states
         self.seconds = 0.0  # that a case took of those simulated last
         self._moved: tuple[Array, Array] | None = None  # start states, and the derivatives there
         self._no_force = np.zeros((len(cut), cut.steps, physics.mj_model.nv), np.float32)
@@ -139,35 +128,31 @@ class Errors:
 
     def columns(self, sigma: Array, here: Array | None = None) -> Array:
         """`[W, n, 2 nv]`, minus the derivatives of the whitened errors by the start states; here: the errors there."""
-        if self.cheaper is not None:
-            return self.cheaper.columns(sigma)
         if self._moved is None or self._moved[0] is not self.offsets:
             here = self.run(self.cut, self.first) if here is None else here
-            nudges = np.diag(np.maximum(START_STEP * self.cut.spread, SIZES.nudge))
+            nudges = np.diag(np.maximum(RULES.change * self.cut.spread, NUDGE))
             there = self.run_each([Case(self.cut, np.tile(n, (len(self.cut), 1))) for n in nudges], self.first)
             each = [(here - error) / n.max() for n, error in zip(nudges, there, strict=True)]
             self._moved = self.offsets, np.stack(each, -1)
         moved = self._moved[1] / sigma[:, None]
         return np.asarray(moved.reshape(len(moved), -1, moved.shape[-1]))
 
-    def differences(self, factor: int) -> Errors:
-        """Where differences at the sub-step h / factor are taken: they need no better integrator than this one."""
-        other = self.cheaper
-        return self if other is None or not other.first <= factor <= other.finest else other
-
     def start(self, sigma: Array) -> None:
-        """Fit the start states: far from the measured motion the time step is worth something else."""
+        """Fit the start states, until a step gains no more than a squared noise a window.
+
+        Far from the measured motion the time step is worth something else.
+        """
         here = self.run(self.cut, self.first)
-        for _ in range(SIZES.starts):
+        gained = np.inf
+        while gained > len(self.cut):
             step = _step(here / sigma, self.columns(sigma, here), self.offsets, self.cut.spread)
             there = self.run(self.cut, self.first, offsets=step)
             before, after = (np.sum((error / sigma) ** 2, (1, 2)) for error in (here, there))
             better = after < before
+            gained = np.sum((before - after)[better])
             if better.any():
                 self.offsets = self.offsets + np.where(better[:, None], step, 0.0)
             here = np.where(better[:, None, None], there, here)
-            if np.minimum(before, after).sum() > SIZES.falls * before.sum():
-                break
 
     def settler(self, sigma: Array) -> Callable[[Array], Array]:
         """Errors -> errors that no change of the start states takes away, by linearisation."""

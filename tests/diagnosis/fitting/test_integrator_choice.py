@@ -69,7 +69,7 @@ def test_what_falls_over_is_not_unstable():
 
 def test_what_no_step_reaches_is_said():
     found = needed(model(0.01, stiffness=1e10, mass=1e-3))
-    assert not found.reached and found.factor == integrator_choice.RULES.finest
+    assert not found.reached and found.factor == integrator_choice.FINEST
     assert "for 0.156 ms too" in found.sentences()[0] and "armature" in found.sentences()[0]
 
 

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.fitting import discretisation, robot
+from bayessim_mjx.diagnosis.fitting import integrator_choice, robot
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.setup import prepare
@@ -27,7 +27,7 @@ def found_at(fit, **setup):
 @pytest.mark.ci
 def test_where_parameters_would_go_at_finer_steps_is_where_the_truth_is(tmp_path, monkeypatch):
     """Ten milliseconds put 1.6 % into the rotor inertia; the other two parameters hardly change. No RK4 here."""
-    monkeypatch.setattr(discretisation, "RULES", dataclasses.replace(discretisation.RULES, nats=np.inf))
+    monkeypatch.setattr(integrator_choice, "simulated", lambda model, logs: np.ones(model.nv, bool))
     path = tmp_path / "pendulum.xml"
     path.write_text(MODEL % (COARSE, "Euler", DAMPING, ARMATURE, 0.0, MASS))
     setup = prepare(robot.of_file(path), recorded(scale=SCALE, sigma=1e-3), Request(FEW))
