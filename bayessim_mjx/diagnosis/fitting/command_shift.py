@@ -32,29 +32,30 @@ class Shift:
     """When commands act.
 
     Attributes:
-        late: s later than the log says; negative: earlier.
-        error: its standard error, and the spread of the conditions' own shifts.
+        late: s later than the log says; negative: earlier. error: its standard error.
+        apart: s, standard deviation of the conditions' own shifts beyond their errors.
         explains: share of the cost above the noise that the shift alone removes.
         step: s, the control step.
     """
 
     late: float
     error: float
+    apart: float
     explains: float
     step: float
 
     @property
     def certain(self) -> bool:
-        """Whether it explains more than all else that is missing does."""
-        return self._shows(abs(self.late)) and self.explains > 1 - self.explains
+        """Whether it explains more than all else that is missing does, in all conditions alike."""
+        return self._shows(abs(self.late), self.error + self.apart) and self.explains > 1 - self.explains
 
     @property
     def likely(self) -> bool:
         """Whether there is a lead, but beside a gap that something else has to explain."""
-        return self._shows(-self.late) and not self.certain
+        return self._shows(-self.late, self.error) and not self.certain
 
-    def _shows(self, size: float) -> bool:
-        return size > max(SURE * self.error, LEAST * self.step)
+    def _shows(self, size: float, error: float) -> bool:
+        return size > max(SURE * error, LEAST * self.step)
 
     @property
     def lead(self) -> float:
@@ -181,13 +182,14 @@ def _judged(q: Quadratic, x: Array, precision: Array, cut: Windows, count: int) 
     robust = inverse @ np.einsum("wi,wj->ij", q.g, q.g) @ inverse
     seen = float(x[0] ** 2 / inverse[0, 0])
     left = max(float(q.c.sum()) - (count - len(x)), 0.0)
-    error = float(np.sqrt(max(robust[0, 0], inverse[0, 0]) + _apart(q, x, precision, cut)))
+    error = float(np.sqrt(max(robust[0, 0], inverse[0, 0])))
+    apart = _apart(q, x, precision, cut)
     explains = seen / (seen + left) if seen > 0 else 0.0  # of logs without a gap, nothing
-    return Shift(AROUND * float(x[0]), AROUND * error, explains, cut.dt)
+    return Shift(AROUND * float(x[0]), AROUND * error, AROUND * apart, explains, cut.dt)
 
 
 def _apart(q: Quadratic, x: Array, precision: Array, cut: Windows) -> float:
-    """Variance of the conditions' own shifts about that of all, beyond their errors, with the other columns free."""
+    """Standard deviation of the conditions' own shifts about that of all, as `Shift`, with the other columns free."""
     names = np.unique(cut.group)
     own = (cut.group[:, None] == names).astype(float)  # [W, G]
     cross = np.einsum("wg,wj->gj", own, q.S[:, 0, 1:])
@@ -195,4 +197,4 @@ def _apart(q: Quadratic, x: Array, precision: Array, cut: Windows) -> float:
     g = np.append(own.T @ q.g[:, 0], q.g[:, 1:].sum(0) - precision[1:] * x[1:])
     inverse = np.linalg.pinv(H, hermitian=True)
     away, errors = (inverse @ g)[: len(names)], np.diag(inverse)[: len(names)]
-    return float(np.mean(np.maximum(away**2 - errors, 0.0)))
+    return float(np.sqrt(np.mean(np.maximum(away**2 - errors, 0.0))))

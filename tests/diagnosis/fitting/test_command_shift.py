@@ -13,7 +13,7 @@ from bayessim_mjx.diagnosis.setup import _measured, _shift
 from bayessim_mjx.logs import Channels, Log, estimate_velocity, resample
 from tests.diagnosis.pendulums import ARMATURE, DAMPING, MASS, MODEL, PERIOD, STEP, nominal, recorded
 
-SURE = {"error": 1e-4, "explains": 0.95, "step": PERIOD}
+SURE = {"error": 1e-4, "apart": 1e-4, "explains": 0.95, "step": PERIOD}
 
 
 def logged_late(logs):
@@ -96,7 +96,7 @@ def test_a_lead_is_moved_away_and_told_not_explained_by_an_effect(tmp_path):
 def test_a_shift_is_told_only_if_nothing_else_would_do_as_well():
     assert Shift(-0.003, **SURE).certain and Shift(0.003, **SURE).certain
     assert not Shift(0.0009, **SURE).certain  # less than a twentieth of a step: a simulator's own
-    for worse in ({"error": 1e-3}, {"explains": 0.45}):
+    for worse in ({"error": 1e-3}, {"apart": 1e-3}, {"explains": 0.45}):
         assert not Shift(-0.003, **{**SURE, **worse}).certain
 
 
