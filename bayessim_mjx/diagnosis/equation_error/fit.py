@@ -129,7 +129,7 @@ def fit(sums: Sums, terms: Sequence[Term]) -> Fit:
         H = weighed @ (sums.gram @ design).reshape(rows_of)
         known = np.concatenate([1.0 / t.sd(values[own]) ** 2 for t, own in zip(terms, spans, strict=True)] or [neutral])
         precision = known + LEAST * np.where(np.diag(H) > 0, np.diag(H), 1.0)
-        covariance = np.linalg.inv(H + np.diag(precision))
+        covariance = np.asarray(np.linalg.inv(H + np.diag(precision)), np.float64)
         values = covariance @ (weighed @ times(sums.gram, rest).ravel() + neutral * precision)
         model, design = _effort(sums.layout, terms, spans, values)
     feasible = bool(np.all(values >= low - LEAST) and np.all(values <= high + LEAST))

@@ -15,7 +15,7 @@ from bayessim_mjx.physics import controllers
 # the robot's length. Rules of thumb, not measured.
 BESIDE, OUT = 1.2, 0.3
 # Share that counts as nothing: of an effort, rms (an effect, a constant, what is unexplained), of a drive's scale, of a
-# joint's top speed. Error rates: benchmarks/records/log_checks.json and first_look.json.
+# joint's top speed, of a log's rows. Error rates: benchmarks/records/log_checks.json and first_look.json.
 LEAST = 0.03
 _JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _NO_MEMORY = tuple(int(getattr(mujoco.mjtDyn, f"mjDYN_{n}")) for n in ("NONE", "FILTER", "FILTEREXACT"))

@@ -105,7 +105,7 @@ class Channel:
     @property
     def static(self) -> bool:
         """Whether nothing but a scale and a constant lies between command and effort, in any row."""
-        return max(self.left, self.peak / SURE) < LEAST and not self.echo
+        return max(self.left, self.peak / 2) < LEAST and not self.echo
 
     @property
     def identified(self) -> bool:
@@ -172,10 +172,11 @@ def _pairs(
     log: Log, model: mujoco.MjModel, own: Sequence[int], ask: Callable[[Log, mujoco.MjModel], Array]
 ) -> list[_Pair]:
     moved = motion(log, model)
-    held, middle = ask(log, model), ask(centred(log), model)
+    on = log.enabled[:, None]  # filters blend what a drive does with what it would do while it is off
+    held, middle = on * ask(log, model), on * ask(centred(log), model)
     rng = np.random.default_rng(0)
     noisy = [x + s * rng.normal(size=x.shape) for x, s in ((log.qpos, log.sigma_qpos), (log.qvel, log.sigma_qvel))]
-    noise = ask(replace(log, qpos=noisy[0], qvel=noisy[1]), model) - held
+    noise = on * ask(replace(log, qpos=noisy[0], qvel=noisy[1]), model) - held
     out = []
     for i in own:
         effort = measured(log, i)
@@ -206,7 +207,8 @@ def _channel(name: str, pairs: Sequence[_Pair], commands: Sequence[Array], behin
     spread = max(float(y @ y - (one @ y) ** 2 / rows), 1e-300)
     varying = each - np.outer(each @ one / rows, one)
     explained = (varying @ y) ** 2 / np.maximum(np.sum(varying**2, 1), 1e-300) / spread
-    lag = nearest(LAGS, explained, np.ones(len(LAGS), bool), rows).seconds
+    late = 1.0 - explained[len(LAGS) // 2] > LEAST**2  # else nothing is left that a lag could explain
+    lag = nearest(LAGS, explained, np.ones(len(LAGS), bool), rows).seconds if late else 0.0
     x = np.array([np.interp(lag, LAGS, column) for column in each.T])
     X = np.stack([x, one], 1)
     c, *_ = np.linalg.lstsq(X, y, rcond=None)

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.logcheck.drives import LEAST
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.signals import quantum
 from bayessim_mjx.logs.velocities import bandwidth
@@ -89,7 +90,7 @@ def clipped(log: Log, targets: Mapping[str, Array]) -> Iterator[Finding]:
         for end in (float(x.max()), float(x.min())):
             flat = _flat(x, end)
             share = float(np.mean(flat))
-            if share > 0 and not (target is not None and _steady(target[flat], quantum(x))):
+            if share > LEAST and not (target is not None and _steady(target[flat], quantum(x))):
                 text = f"{name} is clipped at {end:.5g} ({percent(share)} of the rows"
                 drive = name.startswith("effort:")
                 end_of = "the drive's limit" if drive else "a hard stop"
