@@ -84,7 +84,7 @@ class Channel:
 
     Attributes:
         scale, deviation; late: s; left, peak: share of the effort that this does not explain, rms and at most.
-        constant: in the unit of the effort; size: of the effort, rms.
+        constant, doubt: and its standard deviation, in the unit of the effort; size: of the effort, rms.
         noise: share of the effort that the encoders' noise may make of what a servo is thought to exert.
         sound: it does what it is told. Of efforts in a unit of their own: as the other drives do.
         echo: the logged effort is the command itself, no measurement.
@@ -97,15 +97,21 @@ class Channel:
     left: float
     peak: float
     constant: float
+    doubt: float
     size: float
     noise: float
     echo: bool = False
     sound: bool = False
 
     @property
+    def apart(self) -> float:
+        """Share of the effort that command and constant leave, rms or half of the most: a limit acts in few rows."""
+        return max(self.left, self.peak / 2)
+
+    @property
     def static(self) -> bool:
-        """Whether nothing but a scale and a constant lies between command and effort, in any row."""
-        return max(self.left, self.peak / 2) < LEAST and not self.echo
+        """Whether nothing but a scale and a constant lies between command and effort."""
+        return self.apart < LEAST and not self.echo
 
     @property
     def identified(self) -> bool:
@@ -121,7 +127,7 @@ class Channel:
     @property
     def shifted(self) -> float:
         """The constant where it is surely not 0, else 0."""
-        sure = (LEAST + self.left) * self.size
+        sure = LEAST * self.size + SURE * self.doubt
         return self.constant if abs(self.constant) > sure and self.identified and not self.echo else 0.0
 
 
@@ -146,7 +152,7 @@ def channels_of(
 
 def _judged(c: Channel, common: float, period: float) -> Channel:
     c = replace(c, scale=c.scale / common, deviation=c.deviation / abs(common))
-    obeys = c.left < LEAST + 2.0 * c.noise and abs(c.late) < period
+    obeys = c.apart < LEAST + 2.0 * c.noise and abs(c.late) < period
     return replace(c, sound=bool(obeys and c.off == 1.0 and c.shifted == 0.0))
 
 
@@ -207,17 +213,18 @@ def _channel(name: str, pairs: Sequence[_Pair], commands: Sequence[Array], behin
     spread = max(float(y @ y - (one @ y) ** 2 / rows), 1e-300)
     varying = each - np.outer(each @ one / rows, one)
     explained = (varying @ y) ** 2 / np.maximum(np.sum(varying**2, 1), 1e-300) / spread
-    late = 1.0 - explained[len(LAGS) // 2] > LEAST**2  # else nothing is left that a lag could explain
-    lag = nearest(LAGS, explained, np.ones(len(LAGS), bool), rows).seconds if late else 0.0
+    gap = 1.0 - explained[len(LAGS) // 2] > LEAST**2  # else nothing is left that a lag could explain
+    lag = nearest(LAGS, explained, np.ones(len(LAGS), bool), rows).seconds if gap else 0.0
     x = np.array([np.interp(lag, LAGS, column) for column in each.T])
     X = np.stack([x, one], 1)
     c, *_ = np.linalg.lstsq(X, y, rcond=None)
-    rest = y - X @ c
-    deviation = float(np.sqrt(rest @ rest / max(rows - X.shape[1], 1.0) * np.linalg.pinv(X.T @ X)[0, 0]))
+    (scale, constant), rest = c.tolist(), y - X @ c
+    errors = np.sqrt(rest @ rest / max(rows - X.shape[1], 1.0) * np.diag(np.linalg.pinv(X.T @ X))).tolist()
     size = max(float(np.sqrt(y @ y / rows)), 1e-300)
-    noise = float(np.sqrt(np.mean(np.concatenate([p.noise for p in pairs]) ** 2) * rows / spread)) * abs(float(c[0]))
+    noise = float(np.sqrt(np.mean(np.concatenate([p.noise for p in pairs]) ** 2) * rows / spread)) * abs(scale)
     left, peak = float(np.sqrt(rest @ rest / spread)), float(np.max(np.abs(rest) / one, initial=0.0)) / size
-    return Channel(name, float(c[0]), deviation, lag - behind, left, peak, float(c[1]), size, noise, _echo(pairs))
+    late = lag - behind
+    return Channel(name, scale, errors[0], late, left, peak, constant, errors[1], size, noise, _echo(pairs))
 
 
 def _echo(pairs: Sequence[_Pair]) -> bool:
