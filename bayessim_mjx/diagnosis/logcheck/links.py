@@ -75,9 +75,6 @@ def _untested(name: str, where: str, why: str) -> Link:
     return Link(name, where, False, nan, nan, nan, False, f"{name} at {where}: not tested: {why}")
 
 
-# Command -> effort
-
-
 @dataclass(frozen=True)
 class Channel:
     """One drive: effort = scale * command's force, `late` s after it, plus a constant.
@@ -86,6 +83,7 @@ class Channel:
         scale, deviation; late: s; left, peak: share of the effort that this does not explain, rms and at most.
         constant, doubt: and its standard deviation, in the unit of the effort; size: of the effort, rms.
         noise: share of the effort that the encoders' noise may make of what a servo is thought to exert.
+        cancels: a servo's stiffness over its stiffness and damping together; at least 1.
         sound: it does what it is told. Of efforts in a unit of their own: as the other drives do.
         echo: the logged effort is the command itself, no measurement.
     """
@@ -100,6 +98,7 @@ class Channel:
     doubt: float
     size: float
     noise: float
+    cancels: float
     echo: bool = False
     sound: bool = False
 
@@ -109,25 +108,30 @@ class Channel:
         return max(self.left, self.peak / 2)
 
     @property
+    def least(self) -> float:
+        """Share of the effort that counts as nothing: what does of a servo's terms is more of their sum."""
+        return LEAST * self.cancels
+
+    @property
     def static(self) -> bool:
         """Whether nothing but a scale and a constant lies between command and effort."""
         return self.apart < LEAST and not self.echo
 
     @property
     def identified(self) -> bool:
-        """Whether the log tells what the drive does: noise takes its square off the scale (Fuller 1987, eq. 1.1.6)."""
-        return self.noise**2 < LEAST
+        """Whether the logs tell what it does: errors take their square off the scale (Fuller 1987, eq. 1.1.6)."""
+        return max(self.noise, self.least) ** 2 < LEAST
 
     @property
     def off(self) -> float:
         """The scale where it is surely not 1, else 1."""
-        sure = LEAST + SURE * self.deviation + self.noise**2
+        sure = self.least + SURE * self.deviation + self.noise**2
         return self.scale if abs(self.scale - 1.0) > sure and self.identified and not self.echo else 1.0
 
     @property
     def shifted(self) -> float:
         """The constant where it is surely not 0, else 0."""
-        sure = LEAST * self.size + SURE * self.doubt
+        sure = self.least * self.size + SURE * self.doubt
         return self.constant if abs(self.constant) > sure and self.identified and not self.echo else 0.0
 
 
@@ -144,6 +148,8 @@ def channels_of(
     if not own:
         return ()
     pairs = [_pairs(log, model, own, ask) for log in logs]
+    if not any(len(p[0].effort) for p in pairs):
+        return ()
     period = float(np.median([log.period for log in logs]))
     found = [_better(logs[0].actuators[i], [p[k] for p in pairs], period) for k, i in enumerate(own)]
     common = 1.0 if unit else float(np.median([c.scale for c in found])) or 1.0
@@ -152,7 +158,7 @@ def channels_of(
 
 def _judged(c: Channel, common: float, period: float) -> Channel:
     c = replace(c, scale=c.scale / common, deviation=c.deviation / abs(common))
-    obeys = c.apart < LEAST + 2.0 * c.noise and abs(c.late) < period
+    obeys = c.apart < c.least + 2.0 * c.noise and abs(c.late) < period
     return replace(c, sound=bool(obeys and c.off == 1.0 and c.shifted == 0.0))
 
 
@@ -162,7 +168,7 @@ class _Pair:
 
     Attributes:
         effort: `[T]`; held, centred: `[L, T]`, commanded forces at all LAGS, each with the command as it holds and as
-            it is in the middle of its row; noise: `[T]`, of the commanded force.
+            it is in the middle of its row; noise: `[T]`, of the commanded force; still: `[T]`, it without speed.
         raw: `[2, T]`, commanded force and effort as logged; share: independent rows per row.
     """
 
@@ -170,6 +176,7 @@ class _Pair:
     held: Array
     centred: Array
     noise: Array
+    still: Array
     raw: Array
     share: float
 
@@ -183,13 +190,14 @@ def _pairs(
     rng = np.random.default_rng(0)
     noisy = [x + s * rng.normal(size=x.shape) for x, s in ((log.qpos, log.sigma_qpos), (log.qvel, log.sigma_qvel))]
     noise = on * ask(replace(log, qpos=noisy[0], qvel=noisy[1]), model) - held
+    slow = on * ask(replace(log, qvel=0.0 * log.qvel), model)
     out = []
     for i in own:
         effort = measured(log, i)
         assert effort is not None
         at = [filtered(x[:, i], log, moved, LAGS)[:, moved.free] for x in (held, middle)]
-        still = [filtered(x, log, moved)[moved.free] for x in (effort, noise[:, i])]
-        out.append(_Pair(still[0], at[0], at[1], still[1], np.stack([held[:, i], effort]), moved.share))
+        rows = [filtered(x, log, moved)[moved.free] for x in (effort, noise[:, i], slow[:, i])]
+        out.append(_Pair(rows[0], at[0], at[1], rows[1], rows[2], np.stack([held[:, i], effort]), moved.share))
     return out
 
 
@@ -224,7 +232,9 @@ def _channel(name: str, pairs: Sequence[_Pair], commands: Sequence[Array], behin
     noise = float(np.sqrt(np.mean(np.concatenate([p.noise for p in pairs]) ** 2) * rows / spread)) * abs(scale)
     left, peak = float(np.sqrt(rest @ rest / spread)), float(np.max(np.abs(rest) / one, initial=0.0)) / size
     late = lag - behind
-    return Channel(name, scale, errors[0], late, left, peak, constant, errors[1], size, noise, _echo(pairs))
+    net = np.std(np.concatenate([p.centred[len(LAGS) // 2] for p in pairs]))
+    cancels = max(1.0, float(np.std(np.concatenate([p.still for p in pairs])) / max(net, 1e-300)))
+    return Channel(name, scale, errors[0], late, left, peak, constant, errors[1], size, noise, cancels, _echo(pairs))
 
 
 def _echo(pairs: Sequence[_Pair]) -> bool:
@@ -242,19 +252,18 @@ def _controllers(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
     """Efforts have the unit of ctrl where a law is declared, else that of the model's force."""
     name, declared = "command -> effort", controllers.declared(log.metadata)
     found = {c.actuator: c for c in channels_of([log], mj_model, True, controlled if declared else commanded)}
-    for actuator in log.actuators:
+    for i, actuator in enumerate(log.actuators):
         c = found.get(actuator)
-        if c is None:
+        if measured(log, i) is None:
             yield _untested(name, actuator, "no complete effort stream was logged")
-        elif not np.isfinite(c.noise) or c.left >= 1.0:
+        elif c is None:
+            yield _untested(name, actuator, "too little motion free of contacts and limits")
+        elif 1.0 - c.left < ECHO:
             yield _untested(name, actuator, "command or effort never changes while the drive is on")
         else:
             late = c.late + 0.5 * log.period  # as the stamps say it
             late = late if abs(late) > log.period else 0.0
             yield _link(name, actuator, (c.scale, (1.0 - c.left**2) ** 0.5, late), log.period, declared)
-
-
-# Effort -> motion
 
 
 def _drives(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link]:
@@ -284,9 +293,6 @@ def _compare(predicted: Array, measured: Array, step: float, rows: Mask, lag: fl
     x = x - x.mean()
     norm = float(np.linalg.norm(x) * np.linalg.norm(y))
     return float(x @ y) / max(float(x @ x), 1e-300), float(x @ y) / norm if norm > 0 else 0.0
-
-
-# Motion -> measurement
 
 
 def _sensors(log: Log, timing: Timing) -> Iterator[Link]:
