@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.equation_error.sums import Layout, Sums
+from bayessim_mjx.diagnosis.logcheck.drives import FLOOR
 from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 from bayessim_mjx.diagnosis.statistics import times
@@ -19,8 +20,6 @@ from bayessim_mjx.diagnosis.statistics import times
 Array = NDArray[np.float64]
 
 
-# Of a joint's root mean square effort: so much the filters and derivatives are worth. A choice, not counted.
-FLOOR = 0.01
 # Precision of what has no prior, in units of its own column: products of columns have half the digits of a float64.
 LEAST = float(np.finfo(float).eps) ** 0.5
 Shape = Callable[[Array], Array]  # coefficients [k] of the last round -> maps [nv, P, k]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.logcheck.drives import LEAST, centred, commanded, controlled, efforts, measured
+from bayessim_mjx.diagnosis.logcheck.drives import FLOOR, LEAST, centred, commanded, controlled, efforts, measured
 from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Mask, Regressor, filtered, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import nominal
 from bayessim_mjx.diagnosis.logcheck.timing import LAGS, SURE, Timing, nearest
@@ -108,11 +108,6 @@ class Channel:
         return max(self.left, self.peak / 2)
 
     @property
-    def least(self) -> float:
-        """Share of the effort that counts as nothing: what does of a servo's terms is more of their sum."""
-        return LEAST * self.cancels
-
-    @property
     def static(self) -> bool:
         """Whether nothing but a scale and a constant lies between command and effort."""
         return self.apart < LEAST and not self.echo
@@ -120,18 +115,18 @@ class Channel:
     @property
     def identified(self) -> bool:
         """Whether the logs tell what it does: errors take their square off the scale (Fuller 1987, eq. 1.1.6)."""
-        return max(self.noise, self.least) ** 2 < LEAST
+        return max(self.noise, FLOOR * self.cancels) ** 2 < FLOOR
 
     @property
     def off(self) -> float:
         """The scale where it is surely not 1, else 1."""
-        sure = self.least + SURE * self.deviation + self.noise**2
+        sure = LEAST + SURE * self.deviation + self.noise**2 + FLOOR * self.cancels
         return self.scale if abs(self.scale - 1.0) > sure and self.identified and not self.echo else 1.0
 
     @property
     def shifted(self) -> float:
         """The constant where it is surely not 0, else 0."""
-        sure = self.least * self.size + SURE * self.doubt
+        sure = LEAST * self.size + SURE * self.doubt
         return self.constant if abs(self.constant) > sure and self.identified and not self.echo else 0.0
 
 
@@ -158,7 +153,7 @@ def channels_of(
 
 def _judged(c: Channel, common: float, period: float) -> Channel:
     c = replace(c, scale=c.scale / common, deviation=c.deviation / abs(common))
-    obeys = c.apart < c.least + 2.0 * c.noise and abs(c.late) < period
+    obeys = c.apart < LEAST + 2.0 * c.noise + FLOOR * (c.cancels - 1.0) and abs(c.late) < period
     return replace(c, sound=bool(obeys and c.off == 1.0 and c.shifted == 0.0))
 
 
