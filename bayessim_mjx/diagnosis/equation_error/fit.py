@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.equation_error.sums import Layout, Sums
+from bayessim_mjx.diagnosis.logcheck.drives import FLOOR
 from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 from bayessim_mjx.diagnosis.statistics import times
@@ -19,8 +20,6 @@ from bayessim_mjx.diagnosis.statistics import times
 Array = NDArray[np.float64]
 
 
-# Of a joint's root mean square effort: so much the filters and derivatives are worth. A choice, not counted.
-FLOOR = 0.01
 # Precision of what has no prior, in units of its own column: products of columns have half the digits of a float64.
 LEAST = float(np.finfo(float).eps) ** 0.5
 Shape = Callable[[Array], Array]  # coefficients [k] of the last round -> maps [nv, P, k]
@@ -129,7 +128,7 @@ def fit(sums: Sums, terms: Sequence[Term]) -> Fit:
         H = weighed @ (sums.gram @ design).reshape(rows_of)
         known = np.concatenate([1.0 / t.sd(values[own]) ** 2 for t, own in zip(terms, spans, strict=True)] or [neutral])
         precision = known + LEAST * np.where(np.diag(H) > 0, np.diag(H), 1.0)
-        covariance = np.linalg.inv(H + np.diag(precision))
+        covariance = np.asarray(np.linalg.inv(H + np.diag(precision)), np.float64)
         values = covariance @ (weighed @ times(sums.gram, rest).ravel() + neutral * precision)
         model, design = _effort(sums.layout, terms, spans, values)
     feasible = bool(np.all(values >= low - LEAST) and np.all(values <= high + LEAST))

@@ -14,9 +14,11 @@ from bayessim_mjx.physics import controllers
 # Reach of a load beyond its body's centre of mass, the scale of an unknown payload's place: of the body's own size, of
 # the robot's length. Rules of thumb, not measured.
 BESIDE, OUT = 1.2, 0.3
-# Share that counts as nothing: of an effort, rms (an effect, a constant, what is unexplained), of a drive's scale, of a
-# joint's top speed. Error rates: benchmarks/records/log_checks.json and first_look.json.
-LEAST = 0.03
+# Of a joint's root mean square effort: so much filters and derivatives are worth. A choice, not counted.
+FLOOR = 0.01
+# Share that counts as nothing, three of these standard deviations: of an effort, rms (an effect, a constant, what is
+# unexplained), of a drive's scale, of a joint's top speed, of a log's rows. Error rates: benchmarks/records/.
+LEAST = 3.0 * FLOOR
 _JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _NO_MEMORY = tuple(int(getattr(mujoco.mjtDyn, f"mjDYN_{n}")) for n in ("NONE", "FILTER", "FILTEREXACT"))
 

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.diagnosis.logcheck import drives
-from bayessim_mjx.diagnosis.logcheck.drives import Effort, efforts
+from bayessim_mjx.diagnosis.logcheck.drives import LEAST, Effort, efforts
 from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, LOOSE, Bounded, Mask, Regressor, filtered, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial, moving_bodies, nominal
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding
@@ -40,7 +40,7 @@ class Relation:
 
     Attributes:
         explained: share of the variance, at the best lag that physics allows; None: not tested, `text` says why.
-        late: the motion behind the effort; lag: s of it that are surely another row's, else 0.
+        late: the motion behind the effort; lag: s of it where it is surely another row's and explains something, or 0.
         mend: what would mend it, or nothing.
     """
 
@@ -116,7 +116,8 @@ def _relation(
     # a periodic motion fits one period later too
     far = explained < SOUND or 1.0 - best <= HALF * (1.0 - explained)
     late = nearest(_LAGS, curve, physical | far, test.independent)
-    relation = replace(own, explained=explained, late=late, lag=late.beyond(log.period))
+    lag = late.beyond(log.period) if best - curve[len(_LAGS) // 2] > LEAST**2 else 0.0
+    relation = replace(own, explained=explained, late=late, lag=lag)
     if explained >= SOUND and not relation.lag:
         return relation
     share, mend = (best, "") if explained >= SOUND else _mend(log, mj_model, relation, curve, test)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.logcheck.drives import LEAST, centred, commanded, controlled, efforts, measured
+from bayessim_mjx.diagnosis.logcheck.drives import FLOOR, LEAST, centred, commanded, controlled, efforts, measured
 from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Mask, Regressor, filtered, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import nominal
 from bayessim_mjx.diagnosis.logcheck.timing import LAGS, SURE, Timing, nearest
@@ -75,17 +75,15 @@ def _untested(name: str, where: str, why: str) -> Link:
     return Link(name, where, False, nan, nan, nan, False, f"{name} at {where}: not tested: {why}")
 
 
-# Command -> effort
-
-
 @dataclass(frozen=True)
 class Channel:
     """One drive: effort = scale * command's force, `late` s after it, plus a constant.
 
     Attributes:
         scale, deviation; late: s; left, peak: share of the effort that this does not explain, rms and at most.
-        constant: in the unit of the effort; size: of the effort, rms.
+        constant, doubt: and its standard deviation, in the unit of the effort; size: of the effort, rms.
         noise: share of the effort that the encoders' noise may make of what a servo is thought to exert.
+        cancels: a servo's stiffness over its stiffness and damping together; at least 1.
         sound: it does what it is told. Of efforts in a unit of their own: as the other drives do.
         echo: the logged effort is the command itself, no measurement.
     """
@@ -97,31 +95,38 @@ class Channel:
     left: float
     peak: float
     constant: float
+    doubt: float
     size: float
     noise: float
+    cancels: float
     echo: bool = False
     sound: bool = False
 
     @property
+    def apart(self) -> float:
+        """Share of the effort that command and constant leave, rms or half of the most: a limit acts in few rows."""
+        return max(self.left, self.peak / 2)
+
+    @property
     def static(self) -> bool:
-        """Whether nothing but a scale and a constant lies between command and effort, in any row."""
-        return max(self.left, self.peak / SURE) < LEAST and not self.echo
+        """Whether nothing but a scale and a constant lies between command and effort."""
+        return self.apart < LEAST and not self.echo
 
     @property
     def identified(self) -> bool:
-        """Whether the log tells what the drive does: noise takes its square off the scale (Fuller 1987, eq. 1.1.6)."""
-        return self.noise**2 < LEAST
+        """Whether the logs tell what it does: errors take their square off the scale (Fuller 1987, eq. 1.1.6)."""
+        return max(self.noise, FLOOR * self.cancels) ** 2 < FLOOR
 
     @property
     def off(self) -> float:
         """The scale where it is surely not 1, else 1."""
-        sure = LEAST + SURE * self.deviation + self.noise**2
+        sure = LEAST + SURE * self.deviation + self.noise**2 + FLOOR * self.cancels
         return self.scale if abs(self.scale - 1.0) > sure and self.identified and not self.echo else 1.0
 
     @property
     def shifted(self) -> float:
         """The constant where it is surely not 0, else 0."""
-        sure = (LEAST + self.left) * self.size
+        sure = LEAST * self.size + SURE * self.doubt
         return self.constant if abs(self.constant) > sure and self.identified and not self.echo else 0.0
 
 
@@ -138,6 +143,8 @@ def channels_of(
     if not own:
         return ()
     pairs = [_pairs(log, model, own, ask) for log in logs]
+    if not any(len(p[0].effort) for p in pairs):
+        return ()
     period = float(np.median([log.period for log in logs]))
     found = [_better(logs[0].actuators[i], [p[k] for p in pairs], period) for k, i in enumerate(own)]
     common = 1.0 if unit else float(np.median([c.scale for c in found])) or 1.0
@@ -146,7 +153,7 @@ def channels_of(
 
 def _judged(c: Channel, common: float, period: float) -> Channel:
     c = replace(c, scale=c.scale / common, deviation=c.deviation / abs(common))
-    obeys = c.left < LEAST + 2.0 * c.noise and abs(c.late) < period
+    obeys = c.apart < LEAST + 2.0 * c.noise + FLOOR * (c.cancels - 1.0) and abs(c.late) < period
     return replace(c, sound=bool(obeys and c.off == 1.0 and c.shifted == 0.0))
 
 
@@ -156,7 +163,7 @@ class _Pair:
 
     Attributes:
         effort: `[T]`; held, centred: `[L, T]`, commanded forces at all LAGS, each with the command as it holds and as
-            it is in the middle of its row; noise: `[T]`, of the commanded force.
+            it is in the middle of its row; noise: `[T]`, of the commanded force; still: `[T]`, it without speed.
         raw: `[2, T]`, commanded force and effort as logged; share: independent rows per row.
     """
 
@@ -164,6 +171,7 @@ class _Pair:
     held: Array
     centred: Array
     noise: Array
+    still: Array
     raw: Array
     share: float
 
@@ -172,17 +180,19 @@ def _pairs(
     log: Log, model: mujoco.MjModel, own: Sequence[int], ask: Callable[[Log, mujoco.MjModel], Array]
 ) -> list[_Pair]:
     moved = motion(log, model)
-    held, middle = ask(log, model), ask(centred(log), model)
+    on = log.enabled[:, None]  # filters blend what a drive does with what it would do while it is off
+    held, middle = on * ask(log, model), on * ask(centred(log), model)
     rng = np.random.default_rng(0)
     noisy = [x + s * rng.normal(size=x.shape) for x, s in ((log.qpos, log.sigma_qpos), (log.qvel, log.sigma_qvel))]
-    noise = ask(replace(log, qpos=noisy[0], qvel=noisy[1]), model) - held
+    noise = on * ask(replace(log, qpos=noisy[0], qvel=noisy[1]), model) - held
+    slow = on * ask(replace(log, qvel=0.0 * log.qvel), model)
     out = []
     for i in own:
         effort = measured(log, i)
         assert effort is not None
         at = [filtered(x[:, i], log, moved, LAGS)[:, moved.free] for x in (held, middle)]
-        still = [filtered(x, log, moved)[moved.free] for x in (effort, noise[:, i])]
-        out.append(_Pair(still[0], at[0], at[1], still[1], np.stack([held[:, i], effort]), moved.share))
+        rows = [filtered(x, log, moved)[moved.free] for x in (effort, noise[:, i], slow[:, i])]
+        out.append(_Pair(rows[0], at[0], at[1], rows[1], rows[2], np.stack([held[:, i], effort]), moved.share))
     return out
 
 
@@ -206,16 +216,20 @@ def _channel(name: str, pairs: Sequence[_Pair], commands: Sequence[Array], behin
     spread = max(float(y @ y - (one @ y) ** 2 / rows), 1e-300)
     varying = each - np.outer(each @ one / rows, one)
     explained = (varying @ y) ** 2 / np.maximum(np.sum(varying**2, 1), 1e-300) / spread
-    lag = nearest(LAGS, explained, np.ones(len(LAGS), bool), rows).seconds
+    gap = 1.0 - explained[len(LAGS) // 2] > LEAST**2  # else nothing is left that a lag could explain
+    lag = nearest(LAGS, explained, np.ones(len(LAGS), bool), rows).seconds if gap else 0.0
     x = np.array([np.interp(lag, LAGS, column) for column in each.T])
     X = np.stack([x, one], 1)
     c, *_ = np.linalg.lstsq(X, y, rcond=None)
-    rest = y - X @ c
-    deviation = float(np.sqrt(rest @ rest / max(rows - X.shape[1], 1.0) * np.linalg.pinv(X.T @ X)[0, 0]))
+    (scale, constant), rest = c.tolist(), y - X @ c
+    errors = np.sqrt(rest @ rest / max(rows - X.shape[1], 1.0) * np.diag(np.linalg.pinv(X.T @ X))).tolist()
     size = max(float(np.sqrt(y @ y / rows)), 1e-300)
-    noise = float(np.sqrt(np.mean(np.concatenate([p.noise for p in pairs]) ** 2) * rows / spread)) * abs(float(c[0]))
+    noise = float(np.sqrt(np.mean(np.concatenate([p.noise for p in pairs]) ** 2) * rows / spread)) * abs(scale)
     left, peak = float(np.sqrt(rest @ rest / spread)), float(np.max(np.abs(rest) / one, initial=0.0)) / size
-    return Channel(name, float(c[0]), deviation, lag - behind, left, peak, float(c[1]), size, noise, _echo(pairs))
+    late = lag - behind
+    net = np.std(np.concatenate([p.centred[len(LAGS) // 2] for p in pairs]))
+    cancels = max(1.0, float(np.std(np.concatenate([p.still for p in pairs])) / max(net, 1e-300)))
+    return Channel(name, scale, errors[0], late, left, peak, constant, errors[1], size, noise, cancels, _echo(pairs))
 
 
 def _echo(pairs: Sequence[_Pair]) -> bool:
@@ -233,19 +247,18 @@ def _controllers(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
     """Efforts have the unit of ctrl where a law is declared, else that of the model's force."""
     name, declared = "command -> effort", controllers.declared(log.metadata)
     found = {c.actuator: c for c in channels_of([log], mj_model, True, controlled if declared else commanded)}
-    for actuator in log.actuators:
+    for i, actuator in enumerate(log.actuators):
         c = found.get(actuator)
-        if c is None:
+        if measured(log, i) is None:
             yield _untested(name, actuator, "no complete effort stream was logged")
-        elif not np.isfinite(c.noise) or c.left >= 1.0:
+        elif c is None:
+            yield _untested(name, actuator, "too little motion free of contacts and limits")
+        elif 1.0 - c.left < ECHO:
             yield _untested(name, actuator, "command or effort never changes while the drive is on")
         else:
             late = c.late + 0.5 * log.period  # as the stamps say it
             late = late if abs(late) > log.period else 0.0
             yield _link(name, actuator, (c.scale, (1.0 - c.left**2) ** 0.5, late), log.period, declared)
-
-
-# Effort -> motion
 
 
 def _drives(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link]:
@@ -275,9 +288,6 @@ def _compare(predicted: Array, measured: Array, step: float, rows: Mask, lag: fl
     x = x - x.mean()
     norm = float(np.linalg.norm(x) * np.linalg.norm(y))
     return float(x @ y) / max(float(x @ x), 1e-300), float(x @ y) / norm if norm > 0 else 0.0
-
-
-# Motion -> measurement
 
 
 def _sensors(log: Log, timing: Timing) -> Iterator[Link]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from bayessim_mjx.diagnosis.logcheck.single_log import FEWEST
+from bayessim_mjx.diagnosis.logcheck.single_log import ROWS
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.signals import LEVELS, noise_level, values_shown
@@ -90,10 +90,10 @@ def noise_free(logs: Sequence[Log], column: int) -> bool:
 
 def _smooth(x: Array) -> float | None:
     """Level of the eighth differences of x [T] in that of the fourth ones, where x moves; None: it hardly does."""
-    if len(x) <= FEWEST + 8:
+    if len(x) <= ROWS + 8:
         return None
     changing = np.asarray(np.lib.stride_tricks.sliding_window_view(np.diff(x) != 0, 8).any(1))
-    if changing.sum() < FEWEST:
+    if changing.sum() < ROWS:
         return None
     return _level(x, 8, changing) / max(_level(x, 4, changing), 1e-300)
 

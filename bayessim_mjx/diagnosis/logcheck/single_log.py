@@ -9,12 +9,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.logcheck.drives import LEAST
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.signals import quantum
 from bayessim_mjx.logs.velocities import bandwidth
 from bayessim_mjx.quantities import percent
 
-FEWEST = 20  # rows and control steps: fewer hold no window; a rule of thumb, not counted
+ROWS = 20  # fewer, or half as many control steps, hold no window; a rule of thumb, not counted
 REGISTERS = 2.0**16, 2.0**32  # values that a register of 16 or of 32 bits holds
 _FASTEST = {"hinge": 150.0, "slide": 50.0}  # rad/s, m/s; faster: probably another unit (a rule of thumb)
 
@@ -29,9 +30,9 @@ class Finding:
 
 def size(log: Log, dt: float) -> Iterator[Finding]:
     """Rows, duration and rate against the control period dt [s]."""
-    if min(len(log), log.duration / dt) < FEWEST:
+    if len(log) < ROWS or log.duration < ROWS / 2 * dt:
         have = f"{len(log)} rows over {log.duration:.3g} s"
-        need = f"at least {FEWEST} rows and as many control steps of {dt:.3g} s"
+        need = f"at least {ROWS} rows and {ROWS // 2} control steps of {dt:.3g} s"
         yield Finding("refused", f"too short: {have}; allowed: {need}")
     elif log.period > 20 * dt:
         yield Finding("refused", f"one row per {log.period:.3g} s; allowed: up to 20 control periods of {dt:.3g} s")
@@ -89,7 +90,7 @@ def clipped(log: Log, targets: Mapping[str, Array]) -> Iterator[Finding]:
         for end in (float(x.max()), float(x.min())):
             flat = _flat(x, end)
             share = float(np.mean(flat))
-            if share > 0 and not (target is not None and _steady(target[flat], quantum(x))):
+            if share > LEAST and not (target is not None and _steady(target[flat], quantum(x))):
                 text = f"{name} is clipped at {end:.5g} ({percent(share)} of the rows"
                 drive = name.startswith("effort:")
                 end_of = "the drive's limit" if drive else "a hard stop"
