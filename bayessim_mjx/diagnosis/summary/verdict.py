@@ -14,7 +14,7 @@ from bayessim_mjx.diagnosis.evidence.sets import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.gap import of_one, of_rms
-from bayessim_mjx.diagnosis.residual.origin import Origin, origin
+from bayessim_mjx.diagnosis.residual.disturbance import Origin, origin
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.numbers import FLOOR
