@@ -23,7 +23,7 @@ from bayessim_mjx.diagnosis.residual import motion_inputs
 from bayessim_mjx.diagnosis.residual.disturbance import Linear, estimate
 from bayessim_mjx.diagnosis.residual.motion_inputs import PLAIN, QUANTITIES, WORDS, Features, Inputs, laws, plain
 from bayessim_mjx.diagnosis.residual.regions import FALSE
-from bayessim_mjx.diagnosis.statistics import normal_deviate, times
+from bayessim_mjx.diagnosis.statistics import normal_deviate
 
 Array = NDArray[np.float64]
 Groups = NDArray[np.int64]
@@ -62,27 +62,19 @@ class Problem:
 
 
 class Regression:
-    """A fit's parameters and weights of features together, as one linear model.
-
-    Attributes:
-        columns: `[W, k + nv m, k + nv F]`, from (parameters, weights) to (parameters, forces at the nodes).
-    """
+    """A fit's parameters and weights of features phi `[W, m, nv, F]` together, as one linear model of K = k + nv F."""
 
     def __init__(self, problem: Problem, phi: Array) -> None:
         self.problem, self.phi = problem, phi
-        self.columns = self._columns(phi)
-
-    def _columns(self, phi: Array) -> Array:
-        k, (count, m, nv, each) = self.problem.k, phi.shape
-        out = np.zeros((count, k + nv * m, k + nv * each))
-        out[:, np.arange(k), np.arange(k)] = 1.0
-        for v, scale in enumerate(self.problem.linear.scale):
-            out[:, k + v * m : k + (v + 1) * m, k + v * each : k + (v + 1) * each] = scale * phi[:, :, v]
-        return out
 
     def sums(self, some: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Curvature `[K, K]` and slope `[K]` of some windows."""
-        q, T, weight = self.problem.q, self.columns[some], self.problem.fit.weight[some]
+        k, (count, m, nv, each) = self.problem.k, self.phi[some].shape
+        T = np.zeros((count, k + nv * m, k + nv * each))  # to (parameters, forces at the nodes)
+        T[:, np.arange(k), np.arange(k)] = 1.0
+        for v, scale in enumerate(self.problem.linear.scale):
+            T[:, k + v * m : k + (v + 1) * m, k + v * each : k + (v + 1) * each] = scale * self.phi[some][:, :, v]
+        q, weight = self.problem.q, self.problem.fit.weight[some]
         half = np.concatenate([q.S[some] @ T, q.g[some][..., None]], 2) * weight[:, None, None]
         both = np.tensordot(T, half, ([0, 1], [0, 1]))
         return both[:, :-1], both[:, -1]
@@ -101,8 +93,10 @@ class Regression:
 
     def costs(self, fold: Groups, fits: Array, phi: Array | None = None) -> Array:
         """Costs `[W]` of windows under fits `[folds, K]` without their fold, with other features phi if given."""
-        columns = self.columns if phi is None else self._columns(phi)
-        return self.problem.q.at(times(columns, fits[np.unique(fold, return_inverse=True)[1]]))
+        each, phi = fits[np.unique(fold, return_inverse=True)[1]], self.phi if phi is None else phi
+        weights = each[:, self.problem.k :].reshape(len(phi), *phi.shape[2:]) * self.problem.linear.scale[:, None]
+        force = np.einsum("wmvf,wvf->wvm", phi, weights, optimize=True).reshape(len(phi), -1)
+        return self.problem.q.at(np.concatenate([each[:, : self.problem.k], force], 1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -124,6 +124,8 @@ def orders(disturbance: Disturbance, inputs: Inputs, dof: int, without: Array) -
     spacing = disturbance.time[-1] / (len(disturbance.time) - 0.5)
     pace = float(np.median(np.abs(inputs.speed[..., dof])))
     tried = np.arange(int(np.ceil(2 * np.pi / np.ptp(q))), int(np.pi / (pace * spacing)) + 1 if pace else 0)
+    if not len(tried):
+        return []
     y, gain = disturbance.force[..., dof], disturbance.gain[:, dof]
     w, s, load = (inputs.of(k)[..., dof] @ average for k in ("speed", "direction", "load"))
     flat = [np.ones_like(w), s, w, w * np.abs(w), load, q @ average]

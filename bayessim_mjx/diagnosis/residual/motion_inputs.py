@@ -217,7 +217,7 @@ def named(inputs: Inputs) -> Array:
         smooth, np.sin(inputs.position) * s, np.cos(inputs.position) * s, load, np.abs(load) * s, inputs.pull,
         inputs.past, inputs.stop, inputs.since_reversal * s, time, time * s, time * inputs.effort,
     ]  # fmt: skip
-    return np.concatenate([np.stack(own, 3), _of_others(inputs.direction), _of_others(inputs.pull)], 3)
+    return np.concatenate([np.stack(own, 3), _of_others(inputs.direction)], 3)
 
 
 class Features:
