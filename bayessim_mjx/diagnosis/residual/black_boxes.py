@@ -181,7 +181,7 @@ def flexible(
     runs = [Regression(problem, own(problem.inputs)) for own in features]
     folds = {
         "condition": windows.group,
-        "interpolation": blocks(windows.log, windows.start, windows.steps, len(np.unique(windows.group))),
+        "interpolation": blocks(windows.log, windows.start, windows.steps),
     }
     held = {name: held_out(problem, runs, fold) for name, fold in folds.items()}
     name = max(held, key=lambda n: held[n].gain)
@@ -205,9 +205,9 @@ def flexible(
     return Flexible(held["condition"], held["interpolation"], depends, where, fitter.size)
 
 
-def blocks(log: Groups, start: Groups, steps: int, count: int) -> Groups:
-    """Fold `[W]` of each window, of as many as there are conditions: pairs of windows in a row go to them in turn."""
-    return (start // (2 * steps) + log) % max(count, 2)
+def blocks(log: Groups, start: Groups, steps: int) -> Groups:
+    """Fold `[W]` of each window: pairs of windows in a row go to the parts of a held-out condition in turn."""
+    return (start // (2 * steps) + log) % RULES.parts
 
 
 def _elsewhere(inputs: Inputs, joint: int, quantity: str) -> Inputs:
