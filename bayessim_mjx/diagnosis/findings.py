@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.logcheck.links import Link
 from bayessim_mjx.diagnosis.phrases import notes
+from bayessim_mjx.diagnosis.residual.black_boxes import Flexible
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
-from bayessim_mjx.diagnosis.residual.flexible import Flexible
 from bayessim_mjx.diagnosis.residual.frequency import Heard
 from bayessim_mjx.diagnosis.residual.where import Located
 from bayessim_mjx.diagnosis.selection.budget import Budget, Progress

@@ -27,8 +27,8 @@ from bayessim_mjx.diagnosis.logcheck.links import links as links_of
 from bayessim_mjx.diagnosis.phrases import first_look
 from bayessim_mjx.diagnosis.request import Effects, Request
 from bayessim_mjx.diagnosis.residual import black_boxes, frequency, where
+from bayessim_mjx.diagnosis.residual.black_boxes import Flexible, flexible
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
-from bayessim_mjx.diagnosis.residual.flexible import Flexible, flexible
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.diagnosis.selection import budget, heldout
 from bayessim_mjx.diagnosis.selection.budget import Progress
@@ -67,7 +67,7 @@ def _flexible(found: Findings, model: Model, missing: Disturbance | None = None)
         return None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return flexible(found.setup.fitter, model.fit, missing)
+        return flexible(found.setup.fitter, model.fit, missing.linear if missing else None)
 
 
 def where_it_lies(found: Findings, say: Progress) -> Findings:
@@ -75,7 +75,7 @@ def where_it_lies(found: Findings, say: Progress) -> Findings:
     if found.disturbance is None:
         return found
     fitter, fit = found.setup.fitter, found.selection.state.base.fit
-    located = where.locate(fitter, fit, found.disturbance, seed=found.setup.seed)
+    located = where.locate(fitter, fit, found.disturbance)
     return found.having(Where(located, frequency.analyse(fitter, fit, found.disturbance)))
 
 
@@ -84,7 +84,7 @@ def rivals_without_physics(found: Findings, say: Progress) -> Findings:
     if found.disturbance is None:
         return found
     state, named = found.selection.state, found.model.fit if found.model.effects else None
-    boxes = black_boxes.race(found.setup.fitter, state.base.fit, named, found.disturbance, state.noise)
+    boxes = black_boxes.race(found.setup.fitter, state.base.fit, named, found.disturbance.linear, state.noise)
     return found if boxes is None else found.having(boxes)
 
 

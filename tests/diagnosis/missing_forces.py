@@ -81,3 +81,9 @@ def fitted(logs: list[Log], iterations: int = 8) -> tuple[Fitter, Fit]:
     if iterations:
         (fit,) = fitter.iterate([fit], iterations, lambda f: range(len(f.coordinates)))
     return fitter, fitter.refresh(fit)
+
+
+def known(logs: list[Log]) -> tuple[Fitter, Fit]:
+    """A fit that knows all parameters: none is free."""
+    fitter, _ = fitted(logs, iterations=0)
+    return fitter, fitter.begin(())

@@ -11,7 +11,7 @@ from bayessim_mjx.diagnosis import request
 from bayessim_mjx.diagnosis.evidence.force_left import ForceLeft
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.phrases import notes
-from bayessim_mjx.diagnosis.residual.origin import Origin
+from bayessim_mjx.diagnosis.residual.disturbance import Origin
 from bayessim_mjx.diagnosis.result import FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.summary import how_far, verdict

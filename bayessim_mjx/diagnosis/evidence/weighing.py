@@ -13,8 +13,8 @@ from scipy.special import logsumexp
 from bayessim_mjx.diagnosis.evidence import doubts
 from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, Windows, learn, marginal, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import Integrated, Posterior, belief_of, integrated
+from bayessim_mjx.diagnosis.fitting import forces as disturbance
 from bayessim_mjx.diagnosis.fitting.fit import Fit
-from bayessim_mjx.diagnosis.residual import disturbance
 from bayessim_mjx.diagnosis.selection import heldout
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, PRIORS, RELEVANCE

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bayessim_mjx.diagnosis.phrases.effects import MOST
-from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
-from bayessim_mjx.diagnosis.residual.flexible import Flexible
-from bayessim_mjx.diagnosis.residual.frequency import Heard
-from bayessim_mjx.diagnosis.residual.where import LIMITS, Fingerprint, Located
 from bayessim_mjx.diagnosis.result import Place
 from bayessim_mjx.diagnosis.statistics import Gap, of_one
 from bayessim_mjx.quantities import count, listed, percent
+
+if TYPE_CHECKING:
+    from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes, Flexible
+    from bayessim_mjx.diagnosis.residual.frequency import Heard
+    from bayessim_mjx.diagnosis.residual.where import Fingerprint, Located
 
 AXES = {
     "position": "position", "speed": "speed", "load": "gravity load", "effort": "effort", "time": "time in the log",
@@ -45,7 +46,7 @@ SIGNATURES = {
         {"friction": "against the motion", "drift": "in one direction"},
     ),
     "time since reversal": Signature(
-        "within {recent:g} s after reversals the force against the motion at {joint} is", {"recent": "more/less"}
+        "within {recent:.2g} s after reversals the force against the motion at {joint} is", {"recent": "more/less"}
     ),
     "lag": Signature(
         "the measured motion at {joint} lags behind the simulated one by",
@@ -112,7 +113,7 @@ def _signature(found: Fingerprint) -> str:
         for key, words in own.terms.items()
         if (n := numbers.get(key)) is not None
     ]
-    return f"{own.head.format(joint=found.joint, recent=LIMITS.recent)} {', '.join(parts)}" if parts else ""
+    return f"{own.head.format(joint=found.joint, recent=found.recent)} {', '.join(parts)}" if parts else ""
 
 
 def signed(value: float, low: float, high: float, unit: str, phrase: str) -> str:

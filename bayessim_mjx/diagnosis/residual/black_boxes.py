@@ -1,199 +1,219 @@
-"""Black boxes as rivals of the named effects: a small network and a sparse formula for the force that is missing.
+"""Forces without a name that are fitted to what a model leaves: flexible ones, a small network, a sparse formula.
 
-Both know only positions, speeds and efforts of the joints, and are fitted through the simulator's own columns (as the
-flexible force is) to what the recalibrated simulator leaves, together with its known parameters. All three are scored
-on the same conditions, which none of them saw. Their inputs are measured motion, so that they are favoured: in a
-simulation they would have to live with the motion that they cause.
+All are linear regressions through the simulator's own columns,  r_w = D_w Phi_w beta + B_w x + A_w p + noise,  Phi
+features of the measured motion, and all are scored on conditions that they have not seen. The flexible force knows what
+effects depend on: it shows the part of the gap that motion predicts, and the inputs of that part. Network and formula
+know only positions, speeds and efforts: they are rivals of the named effects. Their inputs are measured motion, so that
+they are favoured: in a simulation they would have to live with the motion that they cause.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import reduce
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.fitting.quadratic import solve
+from bayessim_mjx.diagnosis.fitting.quadratic import RULES, solve
 from bayessim_mjx.diagnosis.residual import motion_inputs
-from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
-from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
-from bayessim_mjx.diagnosis.residual.regression import SIZES as CLIPPED
-from bayessim_mjx.diagnosis.residual.regression import OnFeatures, Regression, Sums
-from bayessim_mjx.diagnosis.statistics import Gap
+from bayessim_mjx.diagnosis.residual.disturbance import Linear, estimate
+from bayessim_mjx.diagnosis.residual.motion_inputs import PLAIN, QUANTITIES, WORDS, Features, Inputs, laws, plain
+from bayessim_mjx.diagnosis.residual.regions import FALSE
+from bayessim_mjx.diagnosis.statistics import Gap, normal_deviate
 
 Array = NDArray[np.float64]
-FOLDS = 4  # of conditions, at most: each is one more training of the network; a rule of thumb
+Groups = NDArray[np.int64]
+
+# Of the mean curvature of each joint's features, a decade apart; the best one is chosen on held-out data. A rule of
+# thumb, not counted: no verdict rests on it
+RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+
+
+class Problem:
+    """What all regressions on a fit share: windows, priors, inputs, costs without a force."""
+
+    def __init__(self, fitter: Fitter, fit: Fit, linear: Linear) -> None:
+        self.fitter, self.fit, self.linear, self.q = fitter, fit, linear, linear.quadratic
+        self.inputs = motion_inputs.measured(fitter.simulator.windows, fitter.simulator.physics.mj_model)
+        self.precision, self.pull, self.low, self.high = fit.prior()
+        self.k, self.nv = fit.A.shape[2], len(linear.scale)
+
+    def base(self, fold: Groups) -> Array:
+        """Held-out costs `[W]` of the fit itself."""
+        return self.fitter.scores(self.fit, fold)[0]
+
+    def with_priors(self, S: Array, g: Array, pulled: Array) -> tuple[Array, Array]:
+        """(curvature, slope) of parameters and weights with their priors; pulled: `[F]`, precision of the weights'."""
+        more = np.concatenate([self.precision + RULES.trust * np.diag(S)[: self.k], pulled])
+        return S + np.diag(more), g + np.concatenate([self.pull, 0 * pulled])
+
+    def solve(self, A: Array, b: Array) -> Array:
+        """Most probable parameters, within their bounds, and weights."""
+        free = np.full(len(b) - self.k, np.inf)
+        return solve(A, b, np.concatenate([self.low, -free]), np.concatenate([self.high, free]))
+
+    def features(self, quantities: Sequence[str], seed: int = 0, physics: bool = False) -> Features:
+        """Of the logs."""
+        return Features(self.inputs, self.linear.average, quantities, seed, physics)
+
+
+class Regression:
+    """A fit's parameters and weights of features phi `[W, m, nv, F]` together, as one linear model of K = k + nv F."""
+
+    def __init__(self, problem: Problem, phi: Array) -> None:
+        self.problem, self.phi = problem, phi
+
+    def sums(self, some: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Curvature `[K, K]` and slope `[K]` of some windows."""
+        k, (count, m, nv, each) = self.problem.k, self.phi[some].shape
+        T = np.zeros((count, k + nv * m, k + nv * each))  # to (parameters, forces at the nodes)
+        T[:, np.arange(k), np.arange(k)] = 1.0
+        for v, scale in enumerate(self.problem.linear.scale):
+            T[:, k + v * m : k + (v + 1) * m, k + v * each : k + (v + 1) * each] = scale * self.phi[some][:, :, v]
+        q, weight = self.problem.q, self.problem.fit.weight[some]
+        half = np.concatenate([q.S[some] @ T, q.g[some][..., None]], 2) * weight[:, None, None]
+        both = np.tensordot(T, half, ([0, 1], [0, 1]))
+        return both[:, :-1], both[:, -1]
+
+    def fitted(self, S: Array, g: Array, ridge: float) -> Array:
+        """`[K]`, with a ridge of the mean curvature of each joint's features."""
+        own = np.diag(S)[self.problem.k :].reshape(self.problem.nv, -1)
+        pulled = np.repeat(ridge * own.mean(1) + np.finfo(np.float32).eps * own.max(), own.shape[1]) + 1e-300
+        return self.problem.solve(*self.problem.with_priors(S, g, pulled))
+
+    def without(self, fold: Groups, ridges: Sequence[float]) -> Array:
+        """`[ridges, folds, K]`, the fits without each fold."""
+        parts = [self.sums(fold == name) for name in np.unique(fold)]
+        S, g = sum(part[0] for part in parts), sum(part[1] for part in parts)
+        return np.array([[self.fitted(S - s, g - t, ridge) for s, t in parts] for ridge in ridges])
+
+    def costs(self, fold: Groups, fits: Array, phi: Array | None = None) -> Array:
+        """Costs `[W]` of windows under fits `[folds, K]` without their fold, with other features phi if given."""
+        each, phi = fits[np.unique(fold, return_inverse=True)[1]], self.phi if phi is None else phi
+        weights = each[:, self.problem.k :].reshape(len(phi), *phi.shape[2:]) * self.problem.linear.scale[:, None]
+        force = np.einsum("wmvf,wvf->wvm", phi, weights, optimize=True).reshape(len(phi), -1)
+        return self.problem.q.at(np.concatenate([each[:, : self.problem.k], force], 1))
 
 
 @dataclass(frozen=True, eq=False)
-class BlackBoxes:
-    """Shares of the recalibrated simulator's squared gap above the noise that are closed, on conditions held out.
+class Held:
+    """Held-out costs under one way of splitting.
 
     Attributes:
-        network, formula: of the black boxes; named: of the effects of the verdict, NaN of none. Below 0: worse than
-            nothing.
-        terms: of the formula that is fitted to all conditions, for people.
-        folds: into which the conditions were divided.
+        cost: `[W]`, of the median seed, unweighted, each fold's with the ridge that is best on the others; base: `[W]`,
+            of the model without the force.
+        totals: `[seeds, ridges]`; seed: the one in `cost`.
+        ridge: the largest that loses less than a standard error against the best (Breiman et al., 1984, sec. 3.4.3).
+        gain: how much cheaper all windows together are.
+        t: of the windows' log gain above the noise by folds, as a normal deviate; unlike the gain itself
+            it is not ruled by the conditions with the largest errors.
     """
 
-    network: float
-    formula: float
-    named: float
-    terms: tuple[Term, ...]
-    folds: int
+    cost: Array
+    base: Array
+    totals: Array
+    ridge: float
+    seed: int
+    gain: float
+    t: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance alone hardly gains as much."""
+        return self.gain > 0 and self.t > normal_quantile()
 
 
-def race(fitter: Fitter, base: Fit, named: Fit | None, missing: Disturbance, noise: float) -> BlackBoxes | None:
-    """All of them on the same windows; None where there is one condition only.
+def normal_quantile() -> float:
+    """The normal deviate beyond which, on either side, chance is as rare as false discoveries."""
+    from scipy.special import ndtri
 
-    Args:
-        base: the fit of the known parameters; named: with the effects, None without any.
-        missing: of the base fit, for its columns; noise: squared residual of a window that is noise alone.
-    """
-    windows = fitter.simulator.windows
-    fold = np.unique(windows.group, return_inverse=True)[1] % FOLDS
-    if len(np.unique(fold)) < 2:
-        return None
-    problem = Regression(fitter, base, missing, motion_inputs.measured(windows, fitter.simulator.physics.mj_model))
-    before, floor = float(problem.base(fold).sum()), noise * len(fold)
-
-    def closed(cost: Array) -> float:
-        return Gap(before, float(cost.sum()), floor).closed
-
-    of_formula, terms = formula_costs(problem, fold)
-    of_names = float("nan") if named is None else closed(fitter.scores(named, fold)[0])
-    return BlackBoxes(closed(network_costs(problem, fold)), closed(of_formula), of_names, terms, len(np.unique(fold)))
+    return float(-ndtri(FALSE / 2))
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Of the network and its training. Rules of thumb, neither tuned nor counted: no verdict rests on them.
+def held_out(problem: Problem, runs: Sequence[Regression], fold: Groups) -> Held:
+    """Held-out costs of regressions that differ in their random features."""
+    costs = np.array([[run.costs(fold, fits) for fits in run.without(fold, RIDGES)] for run in runs])
+    totals, base = costs.sum(2), problem.base(fold)
+    best = int(np.argmin(np.median(totals, 0)))
+    seed = int(np.argsort(totals[:, best])[(len(runs) - 1) // 2])
+    wide = [j for j in range(best, len(RIDGES)) if normal_deviate(costs[seed, j] - costs[seed, best], fold) < 1]
+    cost, names = np.empty(len(fold)), np.unique(fold)
+    for name in names:
+        own = fold == name
+        rest = ~own if len(names) > 1 else own
+        cost[own] = costs[seed, int(np.argmin(np.median(costs[:, :, rest].sum(2), 0))), own]
+    size = problem.fitter.size
+    t = normal_deviate(np.log(np.maximum(base, 0) + size) - np.log(np.maximum(cost, 0) + size), fold)
+    return Held(cost, base, totals, RIDGES[max(wide, default=best)], seed, float(np.sum(base - cost)), t)
+
+
+@dataclass(frozen=True, eq=False)
+class Flexible:
+    """Outcome of the flexible force.
 
     Attributes:
-        hidden: neurons for each joint; iterations: of the training, at most.
-        seeds: networks whose forces are averaged, so that no single draw of first weights counts.
-        spread: prior standard deviations of weights into and out of the hidden layer.
+        condition, interpolation: held out by operating condition, by blocks within conditions.
+        depends_on: [{"input": "elbow speed", "joint", "quantity", "importance"}], largest first; importance: share of
+            the gain that is lost when it is taken from other windows.
+        where: {joint: share of the gain lost without the force on it}; samples: residuals in a window.
     """
 
-    hidden: int = 6
-    seeds: int = 2
-    iterations: int = 40
-    spread: tuple[float, float] = (1.5, 0.3)
+    condition: Held
+    interpolation: Held
+    depends_on: list[dict]
+    where: dict[str, float]
+    samples: int
 
 
-SIZES = Sizes()
+def flexible(
+    fitter: Fitter, fit: Fit, linear: Linear | None = None, *, seeds: Sequence[int] = (0, 1, 2, 3, 4)
+) -> Flexible:
+    """Fit and score a flexible force on top of a fit; one black box tells nothing, so over several seeds.
 
-
-def network_costs(problem: Regression, fold: NDArray[np.int64]) -> Array:
-    """Costs `[W]` of windows under the networks trained without their fold."""
-    inputs = _inputs(problem.inputs)
-    out = np.zeros(len(fold))
-    for name in np.unique(fold):
-        train, test = fold != name, fold == name
-        trained = [_trained(problem, inputs, train, seed) for seed in range(SIZES.seeds)]
-        force = np.mean([_nodes(problem, _force(weights, inputs[:, test])[0]) for weights, _ in trained], 0)
-        step = np.mean([p for _, p in trained], 0)
-        both = np.concatenate([np.broadcast_to(step, (test.sum(), problem.k)), force], 1)
-        out[test] = problem.q_of(test).at(both)
-    return out
-
-
-def _inputs(inputs: Inputs) -> Array:
-    """`[nv, W, H, I]`: position, speed, effort and past effort of the joint, position and speed of all others."""
-    own = [inputs.position, np.tanh(inputs.speed / (0.1 * inputs.speed_scale)), inputs.speed, inputs.effort]
-    own += [inputs.past[..., 0], inputs.past[..., 1]]
-    nv = inputs.position.shape[2]
-    others = [np.stack([np.delete(x, v, 2) for v in range(nv)], 2) for x in (inputs.position, inputs.speed)]
-    z = np.concatenate([np.stack(own, 3), *others], 3)
-    mean, sd = z.mean((0, 1)), z.std((0, 1))
-    z = np.clip((z - mean) / np.where(sd > 1e-12, sd, np.inf), -CLIPPED.limit, CLIPPED.limit)
-    z = np.concatenate([z, np.ones((*z.shape[:3], 1))], 3)
-    return np.ascontiguousarray(np.moveaxis(z, 2, 0))
-
-
-def _force(weights: tuple[Array, Array], z: Array) -> tuple[Array, Array]:
-    """(force `[nv, W, H]` in units of the joints' scale, hidden layer `[nv, W, H, h]`) of inputs `[nv, W, H, I]`."""
-    into, out = weights  # [nv, I, h], [nv, h + 1]
-    hidden = np.tanh(z @ into[:, None])
-    return (hidden @ out[:, None, :-1, None])[..., 0] + out[:, None, -1:], hidden
-
-
-def _nodes(problem: Regression, force: Array) -> Array:
-    """`[W, nv m]`, N m or N at the nodes of the columns, of a force `[nv, W, H]` in units of the joints' scale."""
-    at_nodes = force @ problem.average * problem.scale[:, None, None]
-    return np.asarray(np.moveaxis(at_nodes, 0, 1).reshape(force.shape[1], -1))
-
-
-def _trained(
-    problem: Regression, inputs: Array, train: NDArray[np.bool_], seed: int
-) -> tuple[tuple[Array, Array], Array]:
-    """((weights into, weights out), parameter step) at the most probable weights, misfits as large as the gap."""
-    z, q, weight = inputs[:, train], problem.q_of(train), problem.fit.weight[train]
-    k, (nv, count, _, width) = problem.k, z.shape
-    shapes = (nv, width, SIZES.hidden), (nv, SIZES.hidden + 1)
-    cut = int(np.prod(shapes[0]))
-    spread = np.concatenate([np.full(cut, SIZES.spread[0]), np.full(int(np.prod(shapes[1])), SIZES.spread[1])])
-    doubt = max(float(weight @ q.c), 1e-300) / problem.fitter.numbers
-    Spp, gp = np.einsum("w,wij->ij", weight, q.S[:, :k, :k]), weight @ q.g[:, :k]
-    Spf = weight[:, None, None] * q.S[:, :k, k:]
-
-    def unpacked(x: Array) -> tuple[Array, Array]:
-        return x[:cut].reshape(shapes[0]), x[cut:].reshape(shapes[1])
-
-    def step_of(f: Array) -> Array:
-        if not k:
-            return np.zeros(0)
-        pull = gp + problem.pull - np.sum(Spf @ f[:, :, None], 0)[:, 0]
-        return solve(Spp + np.diag(problem.precision), pull, problem.low, problem.high)
-
-    def cost(x: Array) -> tuple[float, Array]:
-        into, out = unpacked(x)
-        force, hidden = _force((into, out), z)
-        f = _nodes(problem, force)
-        full = np.concatenate([np.broadcast_to(step_of(f), (count, k)), f], 1)
-        pulled = (q.S @ full[:, :, None])[..., 0]
-        each = q.c + np.sum(full * (pulled - 2 * q.g), 1)
-        slope = 2 * weight[:, None] * (pulled - q.g)[:, k:]  # at the best step, whose own slope is none
-        by_node = np.moveaxis(slope.reshape(count, nv, -1), 1, 0) * problem.scale[:, None, None]
-        by_step = (by_node @ problem.average.T)[..., None]
-        # window by window: products of large matrices would call threads that wait for each other
-        to_out = np.concatenate([np.sum(hidden * by_step, (1, 2)), np.sum(by_step, (1, 2))], 1)
-        inner = by_step * out[:, None, None, :-1] * (1 - hidden**2)
-        to_into = np.sum(np.moveaxis(z, 2, 3) @ inner, 1)
-        gradient = np.concatenate([to_into.ravel(), to_out.ravel()]) / doubt + 2 * x / spread**2
-        return float(weight @ each) / doubt + float(np.sum((x / spread) ** 2)), gradient
-
-    start = np.random.default_rng(seed).normal(size=len(spread)) * spread * (np.arange(len(spread)) < cut)
-    found = minimize(cost, start, jac=True, method="L-BFGS-B", options={"maxiter": SIZES.iterations})
-    weights = unpacked(found.x)
-    return weights, step_of(_nodes(problem, _force(weights, z)[0]))
-
-
-@dataclass(frozen=True)
-class Rules:
-    """How large a formula may be.
-
-    A term stays if it explains more than chance does: log(candidates) + log(numbers) / 2 nats (the extended
-    Bayesian criterion of Chen and Chen, 2008), in misfits as large as those that are left. The numbers below are rules
-    of thumb, not counted.
-
-    Attributes:
-        most: terms for each joint on average: what a person reads.
-        tried: terms that are fitted in each turn, the most promising ones by linear algebra.
-        ridge: of the curvature, against terms that are alike.
-        slow: share of the largest speed within which a sign changes gradually.
+    linear: of this fit, None: made here.
     """
+    problem = Problem(fitter, fit, estimate(fitter, fit).linear if linear is None else linear)
+    windows, features = fitter.simulator.windows, [problem.features(QUANTITIES, seed, physics=True) for seed in seeds]
+    runs = [Regression(problem, own(problem.inputs)) for own in features]
+    folds = {
+        "condition": windows.group,
+        "interpolation": blocks(windows.log, windows.start, windows.steps),
+    }
+    held = {name: held_out(problem, runs, fold) for name, fold in folds.items()}
+    name = max(held, key=lambda n: held[n].gain)
+    best, fold = held[name], folds[name]
+    run, fits = runs[best.seed], runs[best.seed].without(fold, [best.ridge])[0]
+    reference = run.costs(fold, fits).sum()
 
-    most: int = 3
-    tried: int = 5
-    ridge: float = 1e-6
-    slow: float = 0.02
+    def lost(phi: Array) -> float:
+        share = (run.costs(fold, fits, phi).sum() - reference) / max(best.gain, 1e-300)
+        return float(np.clip(share, 0.0, 1.0)) if best.gain > 0 else 0.0
+
+    joints = problem.inputs.joints
+    depends: list[dict[str, Any]] = []
+    for v, joint in enumerate(joints):
+        for quantity in QUANTITIES:
+            phi = features[best.seed](_elsewhere(problem.inputs, v, quantity))
+            words = f"{joint} {WORDS[quantity]}"
+            depends.append({"input": words, "joint": joint, "quantity": quantity, "importance": lost(phi)})
+    where = {joint: lost(run.phi * (np.arange(len(joints)) != v)[:, None]) for v, joint in enumerate(joints)}
+    depends.sort(key=lambda d: -d["importance"])
+    return Flexible(held["condition"], held["interpolation"], depends, where, fitter.size)
 
 
-RULES = Rules()
+def blocks(log: Groups, start: Groups, steps: int) -> Groups:
+    """Fold `[W]` of each window: pairs of windows in a row go to the parts of a held-out condition in turn."""
+    return (start // (2 * steps) + log) % RULES.parts
+
+
+def _elsewhere(inputs: Inputs, joint: int, quantity: str) -> Inputs:
+    """The inputs, of which one comes from other windows."""
+    values = np.array(inputs.of(quantity))
+    values[:, :, joint] = np.random.default_rng(0).permutation(values[:, :, joint])
+    return replace(inputs, **{quantity: values})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -205,88 +225,99 @@ class Term:
     force: float
 
 
-def features(inputs: Inputs) -> tuple[Array, tuple[str, ...]]:
-    """(values `[W, H, nv, F]`, names): of the joint itself in rad or m, rad/s or m/s, N m or N."""
-    q, w, u = inputs.position, inputs.speed, inputs.effort
-    sign = np.tanh(w / (RULES.slow * inputs.speed_scale))
-    terms = {
-        "1": np.ones_like(q), "q": q, "q^2": q**2, "q^3": q**3, "sin q": np.sin(q), "cos q": np.cos(q),
-        "w": w, "sign w": sign, "w |w|": w * np.abs(w), "u": u, "|u|": np.abs(u), "u |u|": u * np.abs(u),
-        "|u| sign w": np.abs(u) * sign, "q w": q * w, "q u": q * u, "u w": u * w, "q sign w": q * sign,
-    }  # fmt: skip
-    others = [np.stack([np.delete(x, v, 2) for v in range(q.shape[2])], 2) for x in (q, w, u)]
-    names = [f"{n} of another joint ({i + 1})" for n in "qwu" for i in range(q.shape[2] - 1)]
-    return np.concatenate([np.stack(list(terms.values()), 3), *others], 3), (*terms, *names)
+@dataclass(frozen=True, eq=False)
+class BlackBoxes:
+    """Shares of the recalibrated simulator's squared gap above the noise that are closed, on conditions held out.
+
+    Attributes:
+        network, formula: of the black boxes; named: of the effects of the verdict, NaN of none. Below 0: worse than
+            nothing.
+        terms: of the formula that is fitted to all conditions, for people.
+        folds: conditions, each of which was held out.
+    """
+
+    network: float
+    formula: float
+    named: float
+    terms: tuple[Term, ...]
+    folds: int
 
 
-def formula_costs(problem: Regression, fold: NDArray[np.int64]) -> tuple[Array, tuple[Term, ...]]:
+def race(fitter: Fitter, base: Fit, named: Fit | None, linear: Linear, noise: float) -> BlackBoxes | None:
+    """All of them on the same windows; None where there is one condition only.
+
+    Args:
+        base: the fit of the known parameters; named: with the effects, None without any.
+        linear: of the base fit; noise: squared residual of a window that is noise alone.
+    """
+    fold = fitter.simulator.windows.group
+    if len(np.unique(fold)) < 2:
+        return None
+    problem = Problem(fitter, base, linear)
+    before, floor = float(problem.base(fold).sum()), noise * len(fold)
+
+    def closed(cost: Array) -> float:
+        return Gap(before, float(cost.sum()), floor).closed
+
+    of_formula, terms = formula(problem, fold)
+    of_names = float("nan") if named is None else closed(fitter.scores(named, fold)[0])
+    return BlackBoxes(closed(network(problem, fold)), closed(of_formula), of_names, terms, len(np.unique(fold)))
+
+
+def network(problem: Problem, fold: Groups) -> Array:
+    """Costs `[W]` of windows under networks of one hidden layer trained without their fold."""
+    phi = problem.features(PLAIN)(problem.inputs)
+    return held_out(problem, [Regression(problem, phi)], fold).cost
+
+
+def formula(problem: Problem, fold: Groups) -> tuple[Array, tuple[Term, ...]]:
     """(costs `[W]` of windows under the formulas without their fold, terms of the one of all windows)."""
-    values, names = features(problem.inputs)
-    size = np.sqrt(np.mean(values**2, (0, 1))) + 1e-12
-    on = OnFeatures(problem, np.einsum("hm,whvf->wmvf", problem.average, values / size, optimize=True))
-    parts = on.sums(fold)
-    whole = reduce(Sums.plus, parts)
-    costs = problem.fit.weight * problem.q.c
-    fits = [_chosen(on, whole.minus(part), float(costs[fold != f].sum())) for f, part in enumerate(parts)]
-    beta = _chosen(on, whole, float(costs.sum()))[1].reshape(problem.nv, -1) / size
-    terms = [
-        Term(problem.inputs.joints[v], _named(names[f], problem.inputs.joints, v), float(beta[v, f]))
-        for v, f in np.argwhere(beta)
-    ]
-    return on.costs(fold, fits, on.phi), tuple(terms)
+    values, joints = plain(problem.inputs), problem.inputs.joints
+    size = np.sqrt(np.mean(values**2, (0, 1))) + 1e-300
+    average = problem.linear.average
+    on = Regression(problem, np.einsum("hm,whvf->wmvf", average, values / size, optimize=True))
+    costs, names = problem.fit.weight * problem.q.c, np.unique(fold)
+    fits = np.array([_chosen(on, fold != name, float(costs[fold != name].sum())) for name in names])
+    whole = _chosen(on, fold == fold, float(costs.sum()))[problem.k :].reshape(problem.nv, -1)
+    beta = whole / size * problem.linear.scale[:, None]
+    own = list(laws(problem.inputs))
+    terms = []
+    for v, f in np.argwhere(beta):
+        others = [f"{what} of {other}" for what in "qwu" for i, other in enumerate(joints) if i != v]
+        terms.append(Term(joints[v], [*own, *others][f], float(beta[v, f])))
+    return on.costs(fold, fits), tuple(terms)
 
 
-def _named(name: str, joints: tuple[str, ...], v: int) -> str:
-    """`w of elbow`."""
-    what, _, which = name.partition(" of another joint (")
-    others = [*joints[:v], *joints[v + 1 :]]
-    return f"{what} of {others[int(which[:-1]) - 1]}" if which else what
+def _chosen(on: Regression, some: NDArray[np.bool_], cost: float) -> Array:
+    """`[K]`, numbers with terms by forward selection, the fit's parameters refitted; 0 of terms that are not in.
+
+    A term stays if it explains more than chance does: log(candidates) + log(numbers) / 2 nats (the extended Bayesian
+    criterion of Chen and Chen, 2008), in misfits as large as those that are left.
+    """
+    problem, (S, g) = on.problem, on.sums(some)
+    k, count, numbers = problem.k, len(g), problem.fitter.numbers
+    A, b = problem.with_priors(S, g, np.finfo(np.float32).eps * np.diag(S)[k:] + 1e-300)  # terms may be alike
+    price = np.log(count - k) + 0.5 * np.log(numbers)
+    keep, found, left = np.arange(count) < k, np.zeros(count), np.inf
+    while True:
+        own, trial = np.flatnonzero(keep), np.zeros(count)
+        trial[own] = problem.solve(A[np.ix_(own, own)], b[own])
+        now = max(cost - 2 * float(g @ trial) + float(trial @ S @ trial), 1e-300)
+        if 0.5 * numbers * np.log(left / now) < price:
+            return found
+        found, left = trial, now
+        free, p = keep.copy(), trial[:k]  # parameters that rest at a bound do not move with a further term
+        free[:k] = (p > problem.low) & (p < problem.high)
+        gains = np.where(keep, 0.0, _gains(A, b - A @ trial, free))
+        if not gains.max() > 0:
+            return found
+        keep = keep | (np.arange(count) == np.argmax(gains))
 
 
-def _chosen(on: OnFeatures, sums: Sums, cost: float) -> tuple[Array, Array]:
-    """(parameter step, beta `[nv F]`, 0 of terms that are not in) by forward selection, known parameters refitted."""
-    problem = on.problem
-    unit = np.repeat(problem.scale, on.each)
-    keep = np.zeros(len(sums.g), bool)
-    best, step, beta = _cost(on, sums, keep, cost)
-    numbers = problem.fitter.numbers
-    price = np.log(len(keep)) + 0.5 * np.log(numbers)
-    for _ in range(RULES.most * problem.nv):
-        # parameters that rest at a bound do not move with the term
-        free = (step > problem.low) & (step < problem.high)
-        further = [keep | (np.arange(len(keep)) == i) for i in np.argsort(-_gains(sums, keep, free))[: RULES.tried]]
-        found = [_cost(on, sums, terms, cost) for terms in further]
-        at = int(np.argmin([f[0] for f in found]))
-        if 0.5 * numbers * np.log(best / max(found[at][0], 1e-300)) < price:
-            break
-        keep, (best, step, beta) = further[at], found[at]
-    return step, beta * unit
-
-
-def _gains(sums: Sums, keep: NDArray[np.bool_], free: NDArray[np.bool_]) -> Array:
-    """`[nv F]`, by how much each further term would lower the cost, free parameters and terms so far refitted."""
-    A = np.block([[sums.Spp[np.ix_(free, free)], sums.C[free]], [sums.C[free].T, sums.S]])
-    g = np.concatenate([sums.gp[free], sums.g])
-    inside = np.concatenate([np.ones(int(free.sum()), bool), keep])
-    own = A[np.ix_(inside, inside)] + 1e-9 * np.diag(np.diag(A)[inside] + 1e-300)
-    cross = A[np.ix_(inside, ~inside)]
-    solved = np.linalg.solve(own, np.concatenate([cross, g[inside][:, None]], 1))
-    left = g[~inside] - cross.T @ solved[:, -1]
-    alone = np.diag(A)[~inside]
-    curvature = alone - np.einsum("ij,ij->j", cross, solved[:, :-1])
-    gains = np.full(len(keep), -1.0)
-    gains[~keep] = np.where(curvature > 1e-6 * alone, left**2 / np.maximum(curvature, 1e-300), 0.0)
-    return gains
-
-
-def _cost(on: OnFeatures, sums: Sums, keep: NDArray[np.bool_], cost: float) -> tuple[float, Array, Array]:
-    """(cost, parameter step, beta `[nv F]` in units of the joints' scale) with the terms that are in."""
-    some = np.flatnonzero(keep)
-    own = Sums(sums.S[np.ix_(some, some)], sums.C[:, some], sums.g[some], sums.Spp, sums.gp)
-    problem = on.problem
-    step, inner = problem.together(own, RULES.ridge)
-    beta = np.zeros(len(keep))
-    beta[some] = inner
-    p = step
-    left = cost - 2 * (own.gp @ p + own.g @ inner) + p @ own.Spp @ p + 2 * p @ own.C @ inner + inner @ own.S @ inner
-    return float(left), step, beta
+def _gains(A: Array, slope: Array, inside: NDArray[np.bool_]) -> Array:
+    """`[K]`, by how much each further number would lower the cost, those inside refitted."""
+    cross = A[inside]
+    solved = np.linalg.solve(A[np.ix_(inside, inside)], np.concatenate([cross, slope[inside][:, None]], 1))
+    left, curvature = slope - cross.T @ solved[:, -1], np.diag(A) - np.einsum("ij,ij->j", cross, solved[:, :-1])
+    rounding = np.finfo(np.float32).eps * np.diag(A)
+    return np.where(curvature > rounding, left**2 / np.maximum(curvature, 1e-300), 0.0)

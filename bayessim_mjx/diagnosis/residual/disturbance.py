@@ -1,8 +1,4 @@
-"""The generalised force that is missing in each window: finite-difference columns, a smooth estimate, its spread.
-
-Around a fit a window's residual is  r = D d + B x + A p + noise:  d the force at nodes in time, x the start state,
-p the parameters. The force has a Gaussian-process prior; the marginal likelihood chooses its strength and smoothness.
-"""
+"""The force that is missing in each window, under the model of the evidence; whether it is one, or noise of sensors."""
 
 from __future__ import annotations
 
@@ -11,28 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
-from bayessim_mjx.diagnosis.fitting import scales
+from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, windows_of
+from bayessim_mjx.diagnosis.evidence.parameters import belief_of
+from bayessim_mjx.diagnosis.fitting import forces
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Starts, eliminate, solve
+from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, PRIORS
+from bayessim_mjx.diagnosis.statistics import Z90, normal_deviate, times, variance_parts
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """Pulses that represent the missing force. Rules of thumb, not counted.
-
-    Attributes:
-        pulse: of a finite difference, as a share of the robot's force scale. Less is lost in single precision.
-        columns: forces in a window, about so many. Each costs one simulation of all windows.
-    """
-
-    pulse: float = 0.03
-    columns: int = 72
-
-
-SIZES = Sizes()
+DECISIVE = float(np.log(ODDS.strong))  # nats
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,86 +29,36 @@ class Linear:
         D: `[W, n, nv m]`, minus the derivative of the whitened residual; column v m + k: force of dof v, node k.
         basis: `[H, m]`, force in each control step from the forces at the nodes.
         scale: `[nv]`, size of the forces of this robot, N m or N.
-        r: `[W, n]`, residuals extrapolated to no force, no parameter step and the fit's start states.
-        quadratic: in (the fit's parameters' steps, forces), start states eliminated; starts: what was eliminated.
+        quadratic: in (the fit's parameters' steps, forces), start states eliminated.
     """
 
     D: Array
     basis: Array
     scale: Array
-    r: Array
     quadratic: Quadratic
-    starts: Starts
 
     @property
     def nodes(self) -> int:
+        """m, of each window."""
         return int(self.basis.shape[1])
 
-    def forces(self, flat: Array) -> Array:
-        """`[..., nv m]` -> `[..., H, nv]`, per control step."""
-        nodes = flat.reshape(*flat.shape[:-1], len(self.scale), self.nodes)
-        return np.einsum("hm,...vm->...hv", self.basis, nodes)
-
-
-def default_nodes(fitter: Fitter) -> int:
-    """One node per control step for small robots, fewer where every joint needs its own columns."""
-    steps, nv = fitter.simulator.windows.steps, fitter.simulator.nv
-    return min(steps, max(6, SIZES.columns // nv))
-
-
-def node_basis(steps: int, nodes: int) -> Array:
-    """`[steps, nodes]`: linear between nodes at the centres of equal pieces of the window, constant beyond the ends."""
-    at = (np.arange(nodes) + 0.5) * steps / nodes
-    return np.stack([np.interp(np.arange(steps) + 0.5, at, row) for row in np.eye(nodes)], 1)
-
-
-def force_scale(fitter: Fitter) -> Array:
-    """`[nv]`: the largest force, or what would stop the joint within a window where nothing drives it."""
-    windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
-    found = scales.measure(model, windows.logs)
-    return np.maximum(found.force, found.inertia * found.speed / (windows.steps * windows.dt))
-
-
-def columns(fitter: Fitter, fit: Fit, knots: int, scale: Array | None = None) -> Array:
-    """D `[W, n, nv knots]`, one simulation of all windows per column, start states as in the fit."""
-    windows, nv = fitter.simulator.windows, fitter.simulator.nv
-    basis = node_basis(windows.steps, knots)
-    pulse = SIZES.pulse * (force_scale(fitter) if scale is None else scale)
-    force = np.zeros((nv, knots, 1, windows.steps, nv))
-    for v in range(nv):
-        force[v, :, 0, :, v] = basis.T * pulse[v]
-    count = nv * knots
-    spread = np.broadcast_to(force.reshape(count, 1, windows.steps, nv), (count, len(windows), windows.steps, nv))
-    theta = np.repeat(fitter.vector(fit.coordinates, fit.values)[None], count, 0)
-    shifted = fitter.whiten(fitter.simulator.run(theta, np.repeat(fit.offsets[None], count, 0), force=spread))
-    return np.moveaxis((fit.r[None] - shifted) / np.repeat(pulse, knots)[:, None, None], 0, -1)
+    @property
+    def average(self) -> Array:
+        """`[H, m]`, means around the nodes of what is known in each control step."""
+        return np.asarray(self.basis / self.basis.sum(0))
 
 
 def linearise(fitter: Fitter, fit: Fit, knots: int | None = None, D: Array | None = None) -> Linear:
-    """Columns and quadratic at the fit's point; D: columns of another fit, to save the simulations."""
-    knots = default_nodes(fitter) if knots is None else knots
-    scale = force_scale(fitter)
-    D = columns(fitter, fit, knots, scale) if D is None else D
-    q, starts = eliminate(fit.r, np.concatenate([fit.A, D], 2), fit.B, fit.offsets, fitter.spread)
-    return Linear(D, node_basis(fitter.simulator.windows.steps, knots), scale, fit.r, q, starts)
+    """The residuals' linear model about a fit.
 
-
-@dataclass(frozen=True)
-class Priors:
-    """First guesses of the missing force, from which its likelihood is maximised. Rules of thumb, not counted.
-
-    Attributes:
-        amplitudes: of the force scale, a decade apart: from an integrator's error to a tenth of the drives' forces.
-        memories: node spacings over which the force stays alike: from white to the length of a window.
-        noise: lower end of the factor on the noise's variance, so that no force takes over all of the noise.
+    Args:
+        knots: m, None: as many as are cheap; D: columns of another fit of these windows, to save the simulations.
     """
-
-    amplitudes: tuple[float, ...] = (0.0001, 0.001, 0.01, 0.1)
-    memories: tuple[float, ...] = (1.0, 4.0, 16.0)
-    noise: float = 0.3
-
-
-PRIORS = Priors()
+    knots = forces.default_nodes(fitter) if knots is None else knots
+    scale = forces.force_scale(fitter)
+    D = forces.columns(fitter, fit, knots, scale) if D is None else D
+    q, _ = eliminate(fit.r, np.concatenate([fit.A, D], 2), fit.B, fit.offsets, fitter.spread)
+    return Linear(D, forces.node_basis(fitter.simulator.windows.steps, D.shape[2] // len(scale)), scale, q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,20 +66,15 @@ class Disturbance:
     """The estimated force.
 
     Attributes:
-        force, sd: `[W, m, nv]`, posterior mean and standard deviation, N m or N.
+        force: `[W, m, nv]`, posterior mean, N m or N.
         gain: `[W, nv, m, m]`, expected mean = gain times a true force on this dof (the prior pulls to zero).
-        amplitude: `[nv]`, prior standard deviation.
-        noise: factor on the standard deviation of the measurement noise.
         values: `[k]`, the fit's parameters, estimated together with the force.
         time: `[m]` s after the windows' starts.
         linear: what it was computed from.
     """
 
     force: Array
-    sd: Array
     gain: Array
-    amplitude: Array
-    noise: float
     values: Array
     time: Array
     linear: Linear
@@ -159,161 +90,165 @@ class Disturbance:
         return np.swapaxes(self.force, 1, 2).reshape(len(self.force), -1)
 
 
-def estimate(
-    fitter: Fitter,
-    fit: Fit,
-    knots: int | None = None,
-    *,
-    linear: Linear | None = None,
-    free: bool = True,
-    rounds: int = 2,
-) -> Disturbance:
-    """The smooth force that explains the fit's residuals best.
+def estimate(fitter: Fitter, fit: Fit, linear: Linear | None = None) -> Disturbance:
+    """The smooth force that a fit's residuals make likely; `linear`: of this fit, None: made here.
 
-    Args:
-        knots: nodes per window; None: as many as are cheap.
-        linear: from `linearise`, None: made here.
-        free: the fit's parameters are estimated with the force (within their bounds), else they stay.
-        rounds: how often the residuals are linearised anew around the estimate.
+    With the prior covariance R R' of the force and its posterior covariance R C R', the mean is R (1 - C) R^-1 times a
+    true force. The residuals are linearised anew about a first estimate.
     """
-    linear = linearise(fitter, fit, knots) if linear is None else linear
-    posterior = _strongest(fitter, fit, linear, free)
-    for _ in range(rounds):
-        linear = _relinearise(fitter, fit, linear, posterior)
-        posterior = _refined(replace(posterior, linear=linear), 6)
-    return _finish(fitter, fit, posterior)
-
-
-@dataclass(frozen=True, eq=False)
-class _Posterior:
-    """State of the search: hyperparameters and what follows from them."""
-
-    linear: Linear
-    fit: Fit
-    free: bool
-    memory: float  # in node spacings
-    amplitude: Array
-    noise: float = 1.0  # variance
-    p: Array = None  # type: ignore[assignment]  # [k]
-    d: Array = None  # type: ignore[assignment]  # [W, nv m]
-    cov: Array = None  # type: ignore[assignment]  # [W, nv m, nv m], given p
-    evidence: float = -np.inf
-
-    @property
-    def correlation(self) -> Array:
-        lag = np.abs(np.subtract.outer(np.arange(self.linear.nodes), np.arange(self.linear.nodes)))
-        return np.exp(-lag / self.memory)
-
-    def solved(self) -> _Posterior:
-        """p by generalised least squares, then d given p; all windows at once."""
-        q, k = self.linear.quadratic, self.fit.A.shape[2]
-        inner = np.linalg.inv(self.correlation)
-        P = np.kron(np.diag(1 / self.amplitude**2), inner)
-        S = q.S / self.noise
-        cov = np.asarray(np.linalg.inv(S[:, k:, k:] + P), np.float64)
-        gain = cov @ S[:, k:, :k]  # [W, nv m, k]
-        precision, pull, low, high = self.fit.prior()
-        p = np.zeros(k)
-        weight = self.fit.weight
-        if self.free and k:
-            Spp = np.einsum("w,wij->ij", weight, S[:, :k, :k] - np.einsum("wdi,wdj->wij", S[:, k:, :k], gain))
-            gp = weight @ (q.g[:, :k] / self.noise - np.einsum("wdi,wd->wi", gain, q.g[:, k:] / self.noise))
-            p = solve(Spp + np.diag(precision), gp + pull, low, high)
-        g = q.g[:, k:] / self.noise - S[:, k:, :k] @ p
-        d = np.einsum("wij,wj->wi", cov, g)
-        cost = q.subset(np.arange(k)).at(p) / self.noise - np.einsum("wd,wd->w", g, d)
-        logs = np.linalg.slogdet(cov)[1] + np.linalg.slogdet(P)[1]
-        n = self.linear.r.shape[1]
-        each = -0.5 * (cost - logs + n * np.log(self.noise))
-        penalty = 0.5 * float(precision @ p**2 - 2 * pull @ p)
-        return replace(self, p=p, d=d, cov=cov, evidence=float(weight @ each) - penalty)
-
-    def learnt(self) -> _Posterior:
-        """One step of expectation maximisation for amplitudes and noise, then solved."""
-        q, k, nv = self.linear.quadratic, self.fit.A.shape[2], len(self.linear.scale)
-        inner, weight = np.linalg.inv(self.correlation), self.fit.weight
-        blocks = self.d.reshape(len(self.d), nv, -1)
-        second = np.einsum("wvi,ij,wvj->wv", blocks, inner, blocks)
-        cov = self.cov.reshape(len(self.d), nv, self.linear.nodes, nv, self.linear.nodes)
-        second += np.einsum("wvivj,ij->wv", cov, inner)
-        amplitude = np.sqrt(weight @ second / (weight.sum() * self.linear.nodes))
-        full = np.concatenate([np.repeat(self.p[None], len(self.d), 0), self.d], 1)
-        left = q.at(full) + np.einsum("wij,wji->w", q.S[:, k:, k:], self.cov)
-        noise = max(float(weight @ left) / (weight.sum() * self.linear.r.shape[1]), PRIORS.noise)
-        return replace(self, amplitude=np.maximum(amplitude, 1e-7 * self.linear.scale), noise=noise).solved()
-
-
-def _strongest(fitter: Fitter, fit: Fit, linear: Linear, free: bool) -> _Posterior:
-    """The best of a grid of amplitudes and memories, then refined."""
-    trials = [
-        _refined(_Posterior(linear, fit, free, memory, a * linear.scale).solved(), 2)
-        for memory in PRIORS.memories
-        for a in PRIORS.amplitudes
-    ]
-    return _refined(max(trials, key=lambda t: t.evidence), 12)
-
-
-def _refined(posterior: _Posterior, times: int) -> _Posterior:
-    posterior = posterior.solved()
-    for _ in range(times):
-        posterior = posterior.learnt()
-    return posterior
-
-
-def step_of_starts(linear: Linear, fit: Fit, p: Array, d: Array) -> Array:
-    """dx `[W, s]`, the start states that go with a parameter step p `[k]` or `[W, k]` and forces d `[W, nv m]`."""
-    full = np.concatenate([np.broadcast_to(p, (len(d), fit.A.shape[2])), d], 1)
-    moved = np.einsum("wnk,wk->wn", np.concatenate([fit.A, linear.D], 2), full)
-    b = linear.starts.b - np.einsum("wns,wn->ws", fit.B, moved)
-    return np.einsum("wst,wt->ws", linear.starts.M, b)
-
-
-def _relinearise(fitter: Fitter, fit: Fit, linear: Linear, found: _Posterior) -> Linear:
-    """Residuals simulated at the estimate and taken back along the columns; kept only where it fits better there."""
-    p, d = found.p, found.d
-    dx = step_of_starts(linear, fit, p, d)
-    theta = fitter.vector(fit.coordinates, fit.values + p)
-    r = fitter.whiten(fitter.simulator.run(theta[None], (fit.offsets + dx)[None], force=linear.forces(d)[None]))[0]
-    back = r + np.einsum("wnd,wd->wn", linear.D, d) + np.einsum("wns,ws->wn", fit.B, dx) + fit.A @ p
-    better = np.sum(r**2, 1) < np.sum(fit.r**2, 1)
-    back = np.where(better[:, None], back, linear.r)
-    q, starts = eliminate(back, np.concatenate([fit.A, linear.D], 2), fit.B, fit.offsets, fitter.spread)
-    return replace(linear, r=back, quadratic=q, starts=starts)
-
-
-def _finish(fitter: Fitter, fit: Fit, found: _Posterior) -> Disturbance:
-    linear, windows = found.linear, fitter.simulator.windows
-    shape = (len(found.d), len(linear.scale), linear.nodes)
-    variance = np.einsum("wii->wi", found.cov) + _from_parameters(fit, found)
-    sd = np.sqrt(np.swapaxes(variance.reshape(shape), 1, 2))
-    k = fit.A.shape[2]
-    whole = found.cov @ linear.quadratic.S[:, k:, k:] / found.noise
-    gain = np.einsum("wvivj->wvij", whole.reshape(*shape, *shape[1:]))
-    spacing = windows.steps * windows.dt / linear.nodes
+    linear = linearise(fitter, fit) if linear is None else linear
+    first = _learnt(fitter, fit, linear, fit.r)
+    linear, r = _anew(fitter, fit, linear, first)
+    found = _learnt(fitter, fit, linear, r, [first.hyper])
+    there, step, size = found.marginal, found.step, linear.D.shape[2]
+    cut, shape = fitter.simulator.windows, (len(r), len(linear.scale), linear.nodes)
+    root = np.repeat(linear.scale, linear.nodes)[:, None] * there.root[:size, :size]
+    gain = root @ (np.eye(size) - there.cov[:, :size, :size]) @ np.linalg.inv(root)
     return Disturbance(
-        force=np.swapaxes(found.d.reshape(shape), 1, 2),
-        sd=sd,
-        gain=gain,
-        amplitude=found.amplitude,
-        noise=float(np.sqrt(found.noise)),
-        values=fit.values + found.p,
-        time=np.asarray((np.arange(linear.nodes) + 0.5) * spacing, np.float64),
+        force=_force(linear, found),
+        gain=np.einsum("wvivj->wvij", gain.reshape(*shape, *shape[1:])),
+        values=fit.values + step,
+        time=(np.arange(linear.nodes) + 0.5) * cut.steps * cut.dt / linear.nodes,
         linear=linear,
     )
 
 
-def _from_parameters(fit: Fit, found: _Posterior) -> Array:
-    """`[W, nv m]`: variance of the force from not knowing the parameters exactly."""
-    q, k = found.linear.quadratic, fit.A.shape[2]
-    if not (found.free and k):
-        return np.zeros_like(found.d)
-    S = q.S / found.noise
-    gain = found.cov @ S[:, k:, :k]
-    Spp = np.einsum("w,wij->ij", fit.weight, S[:, :k, :k] - np.einsum("wdi,wdj->wij", S[:, k:, :k], gain))
-    return np.einsum("wdi,ij,wdj->wd", gain, np.linalg.inv(Spp + np.diag(fit.prior()[0])), gain)
+def _learnt(fitter: Fitter, fit: Fit, linear: Linear, r: Array, like: Sequence[Hyper] = ()) -> Learnt:
+    channels = int(fitter.used.sum())
+    windows = windows_of(r, fit.A, fit.B, linear.D, fit.offsets, fitter.spread, linear.scale, channels)
+    return learn(windows, belief_of(fit), like)
 
 
-def pooled(values: Array, reliability: Array, axis: int | Sequence[int] | None = None) -> Array:
-    """Mean of a true force from posterior means: their sum over the sum of their reliabilities."""
-    axis = tuple(axis) if isinstance(axis, Sequence) else axis
-    return np.sum(values, axis) / np.maximum(np.sum(reliability, axis), 1e-9)
+def _means(found: Learnt) -> Array:
+    """`[W, nv m + s]`, posterior means of forces in units of their scale and of start states in their spread."""
+    one = np.concatenate([[1.0], -found.step])
+    return np.asarray(found.marginal.mean @ one @ found.marginal.root.T)
+
+
+def _force(linear: Linear, found: Learnt) -> Array:
+    """`[W, m, nv]`, N m or N."""
+    own = _means(found)[:, : linear.D.shape[2]].reshape(-1, len(linear.scale), linear.nodes)
+    return np.swapaxes(own, 1, 2) * linear.scale
+
+
+def _anew(fitter: Fitter, fit: Fit, linear: Linear, found: Learnt) -> tuple[Linear, Array]:
+    """(linear model, residuals `[W, n]`) simulated at an estimate and taken back; windows only where it fits better."""
+    force, start = _force(linear, found), _means(found)[:, linear.D.shape[2] :] * fitter.spread
+    theta = fitter.vector(fit.coordinates, fit.values + found.step)
+    acting, flat = np.einsum("hm,wmv->whv", linear.basis, force), np.swapaxes(force, 1, 2).reshape(len(force), -1)
+    r = fitter.whiten(fitter.simulator.run(theta[None], start[None], force=acting[None]))[0]
+    back = r + times(linear.D, flat) + times(fit.B, start - fit.offsets) + fit.A @ found.step
+    back = np.where((np.sum(r**2, 1) < np.sum(fit.r**2, 1))[:, None], back, fit.r)
+    q, _ = eliminate(back, np.concatenate([fit.A, linear.D], 2), fit.B, fit.offsets, fitter.spread)
+    return replace(linear, quadratic=q), back
+
+
+def pooled(values: Array, reliability: Array, axis: int | tuple[int, ...] | None = None) -> Array:
+    """Mean of a true force from posterior means: their sum over the sum of their reliabilities; 0 of none."""
+    return np.asarray(np.sum(values, axis) / np.maximum(np.sum(reliability, axis), np.finfo(np.float64).tiny))
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Log likelihoods of what remains, over that of white noise.
+
+    Attributes:
+        sensor, force: nats; deviate: of what the force has more, over its standard error.
+        memory: of the noise of sensors, as a share of a window's length; 0 where it is white.
+    """
+
+    sensor: float
+    force: float
+    deviate: float
+    memory: float
+
+    @property
+    def of_sensors(self) -> bool:
+        """Whether nothing speaks for forces: no strong odds, or no more than a standard error over the windows."""
+        return self.force < self.sensor + DECISIVE or self.deviate < 1
+
+
+def origin(
+    r: Array, B: Array, D: Array, sizes: Array, channels: int, weight: Array, rate: Array | None = None
+) -> Origin:
+    """Whether what a model leaves looks like noise of the sensors or like the work of forces: two covariances compared.
+
+    A force that nobody knows moves the state, so its trace grows within a window; noise of a sensor, whatever its
+    colour, stays as large as it is. Residuals are taken as Gaussian with either covariance beside noise that differs
+    from row to row: of each sensor, and of a clock that jitters, which moves all of a row along its own rate of change.
+    Sizes and memories are those of the largest restricted likelihood, in which the start states have no part (Patterson
+    and Thompson, 1971). Memories are a window's length and quarters of it, down to a row. A command whose time is off
+    by the jitter is a force in the few windows where it jumps, so forces have to be likelier over the windows at large.
+
+    Counted on fresh unknown causes: none of 48 was called noise (c3b3eb0), one of 19 (40adbad). Play, and an elastic
+    gear behind which the motor vibrates, look like noise, too (2 of 2 there).
+
+    Args:
+        r: `[W, n]`, whitened, in the order of time, then of channels; B: `[W, n, s]`, columns of the start states.
+        D: `[W, n, nv m]`, columns of forces of size 1, in the order of degrees of freedom.
+        sizes: `[nv]`, standard deviations of the forces, as large beside each other as these residuals make likely.
+        channels: measured ones; weight: `[W]`.
+        rate: `[W, n]`, how fast what is measured changes, noise sd a second; None: no clock jitters.
+    """
+    nodes, steps = D.shape[2] // len(sizes), r.shape[1] // channels
+    D = D * np.repeat(sizes, nodes)  # a force of 1 N m is much for a wrist and little for a shoulder
+    even, clock = _white(*(x.reshape(len(r), steps, channels) for x in (r, np.zeros_like(r) if rate is None else rate)))
+    kept = np.arange(0, steps, -(-steps // forces.SIZES.columns))  # noise of a row is as large there
+    rows, steps = (kept[:, None] * channels + np.arange(channels)).ravel(), len(kept)
+    own = np.unique(np.linspace(0, len(r) - 1, min(len(r), EFFORT.windows)).round().astype(np.int64))
+    r, B, D, clock, weight = r[own][:, rows], B[own][:, rows], D[own][:, rows], clock[own][:, kept], weight[own]
+    root = np.zeros((len(own), len(rows), len(rows)))
+    for step in range(steps):
+        at, moved = slice(step * channels, (step + 1) * channels), clock[:, step]
+        root[:, at, at] = np.linalg.cholesky(np.diag(even) + moved[:, :, None] * moved[:, None, :])
+    start = np.linalg.qr(np.linalg.solve(root, B), mode="complete")[0][:, :, B.shape[2] :]
+    seen = np.linalg.solve(root.mT, start).mT  # whitens a window and leaves out what its start states can do
+    shares = np.mean(r.reshape(len(own), steps, channels) ** 2, (0, 1))
+    found: dict[str, list[tuple[float, Array, float]]] = {"sensor": [], "force": []}
+    for memory in 4.0 ** -np.arange(1 + int(np.log(steps) / np.log(4.0))):
+        alike = np.kron(_alike(steps, memory), np.diag(shares))
+        pushed = D @ np.kron(np.eye(len(sizes)), _alike(nodes, memory)) @ D.mT
+        for kind, K in (("sensor", alike), ("force", pushed)):
+            found[kind].append((*_likeliest(seen @ K @ seen.mT, times(seen, r), weight), float(memory)))
+    (sensor, by_sensor, memory), (force, by_force, _) = (max(of, key=lambda f: f[0]) for of in found.values())
+    deviate = normal_deviate(by_force - by_sensor, np.arange(len(own)))
+    return Origin(sensor, force, deviate, memory if sensor > DECISIVE else 0.0)
+
+
+def _alike(count: int, memory: float) -> Array:
+    lag = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    return np.asarray(np.exp(-lag / (memory * count)))
+
+
+def _likeliest(K: Array, r: Array, weight: Array) -> tuple[float, Array]:
+    """Largest log likelihood of r `[W, n]` over amounts of K `[W, n, n]` beside white noise; over that noise alone.
+
+    The size of both together is at its best. Returns: (nats, log likelihoods `[W]`).
+    """
+    values, vectors = np.linalg.eigh(K / np.mean(np.einsum("wii->wi", K)))
+    values, square = np.maximum(values, 0.0), times(vectors.mT, r) ** 2
+
+    def each(amount: float) -> Array:
+        misfit, logs = np.sum(square / (1 + amount * values), 1), np.sum(np.log1p(amount * values), 1)
+        level = float(weight @ misfit) / float(weight.sum() * r.shape[1])
+        return np.asarray(-0.5 * weight * (r.shape[1] * np.log(level) + misfit / level + logs))
+
+    ends = np.array([1, -1]) * np.log(np.finfo(np.float32).eps)  # beyond, one of both has no part
+    best = minimize_scalar(lambda x: -float(each(np.exp(x)).sum()), bounds=ends, method="bounded").x
+    return float(np.sum(each(np.exp(best)) - each(0.0))), each(np.exp(best))
+
+
+def _white(r: Array, rate: Array) -> tuple[Array, Array]:
+    """What differs from row to row, from second differences of residuals `[W, steps, channels]`.
+
+    Returns:
+        (`[channels]` variances, no less than what 5 % of the noise's prior are below, `[W, steps, channels]` what one
+        standard deviation of the clock moves).
+    """
+    jumps = np.diff(r, 2, axis=1) ** 2 / 6.0
+    rate = rate / (np.sqrt(np.mean(rate**2)) + 1e-300)
+    around = (rate[:, :-2] ** 2 + 4.0 * rate[:, 1:-1] ** 2 + rate[:, 2:] ** 2) / 6.0
+    kinds = np.zeros((*jumps.shape, r.shape[2] + 1))
+    kinds[..., :-1], kinds[..., -1] = np.eye(r.shape[2]), around  # one clock for all channels
+    parts, _ = variance_parts(jumps.ravel(), kinds.reshape(jumps.size, -1))
+    return np.maximum(parts[:-1], np.exp(-2 * Z90 * PRIORS.noise)), np.sqrt(parts[-1]) * rate

@@ -1,42 +1,28 @@
-"""Where in the state a missing force acts: means over bins with intervals and corrected significance, small trees."""
+"""Where in the state a missing force acts: means over bins with intervals and corrected significance, small trees.
+
+Conditions are what is independent (`statistics`): they make intervals and p-values, and a tree has to predict the force
+in conditions that it has not seen.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import erfc
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
-from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
+from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, pooled
 from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
-from bayessim_mjx.diagnosis.statistics import interval
+from bayessim_mjx.diagnosis.selection.numbers import ODDS
 
 Array = NDArray[np.float64]
 
-
-@dataclass(frozen=True)
-class Rules:
-    """How states are split into regions, and which regions are mentioned. Rules of thumb, not counted, but for `rate`.
-
-    Attributes:
-        bins: of a map; shuffles: of windows, behind its p-values.
-        least: share of the best reliability, below which a node's force is not used.
-        rate: of false discoveries among the significant bins (Benjamini and Hochberg, 1995).
-        depth: of a tree, at most; filled: share of all nodes that every leaf holds at least.
-        worth: share of the held-out power that a deeper tree has to gain.
-    """
-
-    bins: int = 8
-    least: float = 0.3
-    rate: float = 0.05
-    shuffles: int = 300
-    depth: int = 3
-    filled: float = 0.05
-    worth: float = 0.05
-
-
-RULES = Rules()
+# Share of the squared gap, or of a force's power, from which on a part of it is mentioned: as much as decides a verdict
+# (`summary.verdict.Limits.share`, docs/decisions/force_left.md)
+MENTIONED = 0.1
+FALSE = 1 / ODDS.strong  # rate of false discoveries
 ALONG = "force along the motion"
 # axis -> (quantity, of what force): along the motion means times the direction of motion
 AXES = {
@@ -66,104 +52,78 @@ class Nodes:
 
     @property
     def reliability(self) -> Array:
+        """`[W, m]`, how much of a constant force the estimate shows."""
         return np.asarray(self.gain.sum(2))
 
-    @property
-    def used(self) -> NDArray[np.bool_]:
-        return self.reliability > RULES.least * self.reliability.max()
+    def target(self, kind: str) -> Array:
+        """`[W, m]`, the force, or the force times the direction of motion: negative is against it."""
+        return self.force * np.sign(self.axes["direction"]) if kind == ALONG else self.force
 
-    def along(self) -> Array:
-        """Force times direction of motion: negative is against it."""
-        return self.force * np.sign(self.axes["direction"])
+    def limits(self, axis: str, some: NDArray[np.bool_] | None = None) -> Array:
+        """Inner edges of about equally filled bins of some nodes; as many bins as windows need by Rice's rule.
 
-    def target(self, axis: str) -> Array:
-        return self.along() if AXES[axis][1] == ALONG else self.force
+        Rice's rule is twice the cube root of their number (Terrell and Scott, 1985).
+        """
+        if axis == "direction":
+            return np.zeros(1)
+        values = self.axes[axis] if some is None else self.axes[axis][some]
+        count = int(np.ceil(2 * np.cbrt(len(self.force))))
+        return np.unique(np.quantile(values, np.arange(1, count) / count))
 
 
 def nodes(disturbance: Disturbance, inputs: Inputs, dof: int) -> Nodes:
-    """One dof's samples."""
-    basis = disturbance.linear.basis
-    average = basis / basis.sum(0)
+    """One dof's force and quantities."""
     axes, units = {}, {}
     angle, force = inputs.angle_unit[dof], inputs.force_unit[dof]
     of = {"position": angle, "speed": f"{angle}/s", "load": force, "effort": force, "time": "s", "since_reversal": "s"}
     for axis, (quantity, _) in AXES.items():
         values = inputs.of(quantity)[..., dof]
-        axes[axis] = (np.abs(values) if axis.endswith("size") else values) @ average
+        axes[axis] = (np.abs(values) if axis.endswith("size") else values) @ disturbance.linear.average
         units[axis] = of.get(quantity, "")
     return Nodes(disturbance.force[..., dof], disturbance.gain[:, dof], axes, units, inputs.joints[dof], force)
 
 
-def bins(node: Nodes, axis: str) -> tuple[Array, NDArray[np.int64]]:
-    """(edges `[n + 1]`, bin of each node `[W, m]`, -1 where it is not used); about equally filled."""
-    values = node.axes[axis]
-    if axis == "direction":
-        edges = np.array([-1.0, 0.0, 1.0])
-    else:
-        edges = (
-            np.unique(np.quantile(values[node.used], np.linspace(0, 1, RULES.bins + 1)))
-            if node.used.any()
-            else np.zeros(1)
-        )
-    if len(edges) < 3:
-        return np.zeros(0), np.full(values.shape, -1)
-    index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
-    return edges, np.where(node.used, index, -1)
-
-
-def force_map(node: Nodes, axis: str, without: Array, rng: np.random.Generator) -> tuple[dict, Array]:
-    """(numbers for a picture without `significant`, p-values per bin).
+def force_map(node: Nodes, axis: str, without: Array) -> tuple[dict, Array]:
+    """Mean forces over the bins of an axis.
 
     Args:
-        without: `[G, W]`, windows without each condition (`clusters.leave_one_out`).
-        rng: for the permutation of windows: a bin is significant if its mean differs from that of all nodes more than
-            with the axis taken from other windows.
+        without: `[G, W]`, windows without each condition (`statistics.leave_one_out`).
+
+    Returns:
+        (numbers for a picture without `significant`, p-values `[bins]` of a mean that is that of all nodes); nothing of
+        an axis that does not change.
     """
-    edges, index = bins(node, axis)
-    count = max(len(edges) - 1, 0)
-    if not count:
+    values, force, reliability = node.axes[axis], node.target(AXES[axis][1]), node.reliability
+    inner, ends = node.limits(axis), (float(values.min()), float(values.max()))
+    inner = inner[(inner > ends[0]) & (inner < ends[1])]
+    if not len(inner):
         return {}, np.zeros(0)
-    force, reliability = node.target(axis), node.reliability
-    each = np.stack([np.where(index == b, x, 0.0).sum(1) for b in range(count) for x in (force, reliability)], 1)
-    each = each.reshape(len(force), count, 2)
-    total = each.sum(0)
-    replicates = np.einsum("gw,wbx->bgx", without, each)
-    means = total[:, 0] / np.maximum(total[:, 1], 1e-9)
-    spread = [interval(m, w[:, 0] / np.maximum(w[:, 1], 1e-9)) for m, w in zip(means, replicates, strict=True)]
-    low, high = (np.array(x) for x in zip(*spread, strict=True))
+    index, count = np.searchsorted(inner, values, side="right"), len(inner) + 1
+    inside = index[..., None] == np.arange(count)
+    sums, shown = (np.einsum("wm,wmb->wb", x, inside) for x in (force, reliability))
+    means, replicates = pooled(sums, shown, 0), pooled(without @ sums, without @ shown, ())
+    whole = pooled(without @ sums, without @ shown, 1)[:, None]
+    spread = [statistics.interval(m, r) for m, r in zip(means, replicates.T, strict=True)]
+    low, high = (list(x) for x in zip(*spread, strict=True))
     found = {
         "joint": node.joint, "axis": axis, "quantity": AXES[axis][1], "unit": node.units[axis],
-        "force_unit": node.force_unit, "edges": edges.tolist(), "mean": means.tolist(), "low": low.tolist(),
-        "high": high.tolist(), "count": [int(np.sum(index == b)) for b in range(count)],
+        "force_unit": node.force_unit, "edges": [ends[0], *inner.tolist(), ends[1]], "mean": means.tolist(),
+        "low": low, "high": high, "count": inside.sum((0, 1)).tolist(),
     }  # fmt: skip
-    return found, _p_values(force, reliability, index, means, count, rng)
+    return found, _p_values(means - pooled(sums, shown), replicates - whole)
 
 
-def _p_values(
-    force: Array, reliability: Array, index: NDArray[np.int64], means: Array, count: int, rng: np.random.Generator
-) -> Array:
-    """Two-sided, from the mean and spread of each bin's contrast under permutation of the windows."""
-    used = index >= 0
-    centre = np.sum(force[used]) / max(float(np.sum(reliability[used])), 1e-9)
-    left = np.where(used, force - centre * reliability, 0.0)
-    null = np.zeros((RULES.shuffles, count))
-    for k in range(RULES.shuffles):
-        shuffled = index[rng.permutation(len(index))]
-        both = used & (shuffled >= 0)
-        below = np.bincount(shuffled[both], reliability[both], count)
-        null[k] = np.bincount(shuffled[both], left[both], count) / np.maximum(below, 1e-9)
-    z = np.abs(means - centre - null.mean(0)) / np.maximum(null.std(0, ddof=1), 1e-300)
-    return np.array([erfc(x / np.sqrt(2)) for x in z])
+def _p_values(value: Array, replicates: Array) -> Array:
+    """Two-sided, of estimates `[k]` by replicates `[G, k]`, each without one condition; 1 of few conditions."""
+    if len(replicates) < 2:
+        return np.ones(len(value))
+    error = np.maximum(statistics.error(replicates), np.finfo(np.float64).tiny)
+    return np.asarray(2 * stats.t.sf(np.abs(value) / error, len(replicates) - 1))
 
 
-def discoveries(p: Array, rate: float = RULES.rate) -> NDArray[np.bool_]:
-    """Benjamini and Hochberg (1995): which of many hypotheses to reject."""
-    order = np.argsort(p)
-    passed = np.flatnonzero(p[order] <= rate * np.arange(1, len(p) + 1) / max(len(p), 1))
-    out = np.zeros(len(p), bool)
-    if len(passed):
-        out[order[: passed.max() + 1]] = True
-    return out
+def discoveries(p: Array) -> NDArray[np.bool_]:
+    """Which of many hypotheses to reject (Benjamini and Hochberg, 1995)."""
+    return np.asarray(stats.false_discovery_control(p) <= FALSE) if len(p) else np.zeros(0, bool)
 
 
 @dataclass(frozen=True)
@@ -192,72 +152,62 @@ SPLITS = {
 
 
 def tree(node: Nodes, group: NDArray[np.int64]) -> Tree:
-    """The shallowest tree, of either kind of force, that predicts the force of held-out groups about best."""
-    best: tuple[float, str, int] | None = None
-    for depth in range(RULES.depth + 1):
-        for target in SPLITS:
-            r2 = _held_out(node, target, depth, group)
-            if best is None or r2 > best[0] + RULES.worth:
-                best = (r2, target, depth)
-    assert best is not None
-    r2, target, depth = best
-    y, rel, x = _table(node, target)
-    power = max(float(np.sum(y**2)), 1e-300)
+    """The tree, of either kind of force, that predicts the force of held-out groups.
+
+    The shallowest one that says as much; the search ends where neither one nor two more levels say more.
+    """
+    r2, target, at, depth = -np.inf, "", 0, 0
+    while depth <= at + 1:
+        found, kind = max((_held_out(node, target, depth, group), target) for target in SPLITS)
+        if not depth or found > r2 + MENTIONED:
+            r2, target, at = found, kind, depth
+        depth += 1
+    y, rel = node.target(target), node.reliability
     leaves = []
-    for where, pick in _grow(y, rel, x, np.ones(len(y), bool), depth, ()):
-        mean = float(y[pick].sum() / max(rel[pick].sum(), 1e-9))
-        explained = power_of(y[pick], rel[pick], mean) / power
-        leaves.append(Leaf(where, mean, int(pick.sum()), explained))
+    for where in _grown(node, target, np.ones(y.shape, bool), at, ()):
+        pick = _inside(node, where)
+        mean = float(pooled(y[pick], rel[pick]))
+        explained = float(np.sum(y[pick] ** 2 - (y[pick] - rel[pick] * mean) ** 2))
+        leaves.append(Leaf(where, mean, int(pick.sum()), explained / max(float(np.sum(y**2)), 1e-300)))
     return Tree(tuple(sorted(leaves, key=lambda leaf: -leaf.share)), target, r2)
 
 
-def power_of(y: Array, rel: Array, mean: float) -> float:
-    """How much of sum y^2 a constant force explains."""
-    return float(np.sum(y**2) - np.sum((y - rel * mean) ** 2))
+Where = tuple[tuple[str, bool, float], ...]
 
 
-def _table(node: Nodes, target: str) -> tuple[Array, Array, dict[str, Array]]:
-    used = node.used
-    y = (node.along() if target == ALONG else node.force)[used]
-    return y, node.reliability[used], {a: node.axes[a][used] for a in SPLITS[target]}
+def _inside(node: Nodes, where: Where) -> NDArray[np.bool_]:
+    pick = np.ones(node.force.shape, bool)
+    for axis, above, limit in where:
+        pick &= (node.axes[axis] > limit) == above
+    return pick
 
 
-def _grow(y: Array, rel: Array, x: dict[str, Array], pick: NDArray[np.bool_], depth: int, where: tuple) -> list:
-    """[(conditions, rows)] of the leaves below the rows `pick`."""
-    best = (0.0, "", 0.0)
-    least = RULES.filled * len(y)
-    if depth and pick.any():
-        for axis, values in x.items():
-            for limit in np.unique(np.quantile(values[pick], np.linspace(0.1, 0.9, 9))):
-                high = pick & (values > limit)
-                low = pick & ~high
-                if min(high.sum(), low.sum()) < least:
-                    continue
-                gain = sum(y[s].sum() ** 2 / max(rel[s].sum(), 1e-9) for s in (high, low))
-                if gain > best[0]:
-                    best = (float(gain), axis, float(limit))
+def _grown(node: Nodes, target: str, some: NDArray[np.bool_], depth: int, where: Where) -> list[Where]:
+    """Leaves below `where`, each split as explains most of the force at the nodes `some`."""
+    y, rel, best = node.target(target), node.reliability, (0.0, "", 0.0)
+    for axis in SPLITS[target] if depth and some.any() else ():
+        values = node.axes[axis]
+        for limit in node.limits(axis, some):
+            both = some & (values > limit), some & (values <= limit)
+            if all(side.any() for side in both):
+                gain = float(sum(y[side].sum() * pooled(y[side], rel[side]) for side in both))
+                best = max(best, (gain, axis, float(limit)))
     if not best[1]:
-        return [(where, pick)]
+        return [where]
     _, axis, limit = best
-    high = pick & (x[axis] > limit)
-    up = _grow(y, rel, x, high, depth - 1, (*where, (axis, True, limit)))
-    return up + _grow(y, rel, x, pick & ~high, depth - 1, (*where, (axis, False, limit)))
+    sides = [(above, some & ((node.axes[axis] > limit) == above)) for above in (True, False)]
+    parts = [_grown(node, target, side, depth - 1, (*where, (axis, above, limit))) for above, side in sides]
+    return [leaf for part in parts for leaf in part]
 
 
 def _held_out(node: Nodes, target: str, depth: int, group: NDArray[np.int64]) -> float:
     """Share of the force's power predicted on groups that the tree has not seen."""
-    y, rel, x = _table(node, target)
-    of = np.repeat(group[:, None], node.force.shape[1], 1)[node.used]
+    y, rel, names = node.target(target), node.reliability, np.unique(group)
     left = 0.0
-    for name in np.unique(of):
-        train, out = of != name, of == name
-        if not train.any():
-            return -np.inf
-        inside = {a: v[train] for a, v in x.items()}
-        for where, pick in _grow(y[train], rel[train], inside, np.ones(int(train.sum()), bool), depth, ()):
-            mean = y[train][pick].sum() / max(rel[train][pick].sum(), 1e-9)
-            here = out.copy()
-            for axis, above, limit in where:
-                here &= (x[axis] > limit) == above
-            left += float(np.sum((y[here] - rel[here] * mean) ** 2))
-    return 1.0 - left / max(float(np.sum(y**2)), 1e-300)
+    for name in names if len(names) > 1 else ():
+        out = np.broadcast_to((group == name)[:, None], y.shape)
+        for where in _grown(node, target, ~out, depth, ()):
+            here = _inside(node, where)
+            mean = pooled(y[here & ~out], rel[here & ~out])
+            left += float(np.sum((y[here & out] - rel[here & out] * mean) ** 2))
+    return 1.0 - left / max(float(np.sum(y**2)), 1e-300) if len(names) > 1 else -np.inf

@@ -15,28 +15,12 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.residual import motion_inputs, regions
-from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate, step_of_starts
+from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.residual.motion_inputs import Inputs
-from bayessim_mjx.diagnosis.residual.regions import ALONG, Leaf, Nodes, Tree
-from bayessim_mjx.diagnosis.statistics import interval, of_one
+from bayessim_mjx.diagnosis.residual.regions import ALONG, MENTIONED, Leaf, Nodes, Tree
+from bayessim_mjx.diagnosis.statistics import of_one
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Rules:
-    """When a place is mentioned. Rules of thumb, not counted.
-
-    Attributes:
-        worth: share of the gap from which on a joint has a sentence.
-        least_share: share of a joint's missing power that a region has to explain.
-    """
-
-    worth: float = 0.1
-    least_share: float = 0.15
-
-
-RULES = Rules()
 
 
 @dataclass(frozen=True)
@@ -75,31 +59,28 @@ class Located:
     prints: tuple[Fingerprint, ...] = ()
 
 
-def locate(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None, *, seed: int = 0) -> Located:
+def locate(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None) -> Located:
     """Places of the gap that a fit leaves; `disturbance`: of this fit, None: estimated here."""
     if of_one(float(fit.quadratic(fitter.spread)[0].c.mean()), fitter.size).at_noise:
         return Located()
     disturbance = estimate(fitter, fit) if disturbance is None else disturbance
     windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model
-    inputs = motion_inputs.measured(windows, model)
-    rng = np.random.default_rng(seed)
-    without = statistics.leave_one_out(windows.group)
+    inputs, without = motion_inputs.measured(windows, model), statistics.leave_one_out(windows.group)
     each = explained(fit, disturbance)
     kept = np.maximum(each.sum(0), 0.0)
     share, spread = kept / max(kept.sum(), 1e-300), statistics.interval_of_shares(each, windows.condition)
     node = [regions.nodes(disturbance, inputs, v) for v in range(len(share))]
-    worth = [v for v in np.argsort(-share) if share[v] > RULES.worth]
-    maps = _maps([node[v] for v in worth], without, rng)
-    trees = {v: regions.tree(node[v], windows.group) for v in worth}
-    prints = [f for v in worth for f in fingerprints(fitter, fit, disturbance, inputs, v, node[v], without)]
+    some = [v for v in np.argsort(-share) if share[v] > MENTIONED]
+    trees = {v: regions.tree(node[v], windows.group) for v in some}
+    prints = [f for v in some for f in fingerprints(fitter, fit, inputs, v, node[v])]
     spots = [_spot(node[v], trees.get(v), float(share[v]), spread[v]) for v in np.argsort(-share)]
-    return Located(tuple(spots), tuple(maps), tuple(prints))
+    return Located(tuple(spots), tuple(_maps([node[v] for v in some], without)), tuple(prints))
 
 
 def _spot(node: Nodes, found: Tree | None, share: float, ci: tuple[float, float]) -> Spot:
-    size = float(np.sqrt(np.mean(node.force[node.used] ** 2))) if node.used.any() else 0.0
-    every = () if found is None or found.r2 <= RULES.least_share else found.leaves
-    leaves = tuple([leaf for leaf in every if leaf.share > RULES.least_share][:3])
+    size = float(np.sqrt(np.mean(node.force**2)))
+    every = () if found is None or found.r2 <= MENTIONED else found.leaves
+    leaves = tuple(leaf for leaf in every if leaf.share > MENTIONED)
     along = found is not None and found.target == ALONG
     return Spot(node.joint, node.force_unit, share, ci, size, found is not None, leaves, node.units, along)
 
@@ -116,32 +97,12 @@ def explained(fit: Fit, disturbance: Disturbance) -> Array:
     return drop.reshape(len(d), disturbance.force.shape[2], -1).sum(2) * fit.weight[:, None]
 
 
-def _maps(nodes: list[Nodes], without: Array, rng: np.random.Generator) -> list[dict]:
+def _maps(nodes: list[Nodes], without: Array) -> list[dict]:
     """All maps of all joints; which bins are significant is decided over all of them together."""
-    made = [regions.force_map(node, axis, without, rng) for node in nodes for axis in regions.AXES]
+    made = [regions.force_map(node, axis, without) for node in nodes for axis in regions.AXES]
     made = [(m, p) for m, p in made if m]
-    if not made:
-        return []
-    found = regions.discoveries(np.concatenate([p for _, p in made]))
-    ends = np.cumsum([len(p) for _, p in made])
-    parts = np.split(found, ends[:-1])
-    return [m | {"significant": part.tolist()} for (m, _), part in zip(made, parts, strict=True)]
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Which parts of a signature are mentioned. Rules of thumb, not counted.
-
-    Attributes:
-        recent: s after a reversal, in which a force counts as recent.
-        small: share of the force's rms, below which a part is not mentioned.
-    """
-
-    recent: float = 0.1
-    small: float = 0.2
-
-
-LIMITS = Limits()
+    found = iter(regions.discoveries(np.concatenate([np.zeros(0), *(p for _, p in made)])).tolist())
+    return [m | {"significant": [next(found) for _ in p]} for m, p in made]
 
 
 @dataclass(frozen=True)
@@ -161,69 +122,53 @@ class Number:
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """One signature at one joint: its numbers, and the share of the force's rms that each one carries."""
+    """One signature at one joint.
+
+    Attributes:
+        numbers: its coefficients; weight: share of the force's power that each one carries.
+        recent: s after a reversal that count as shortly after it.
+    """
 
     name: str
     joint: str
     numbers: dict[str, Number]
     weight: dict[str, float]
+    recent: float
 
     @property
     def relevant(self) -> dict[str, Number]:
         """The numbers that matter: clear, and not small."""
-        return {k: n for k, n in self.numbers.items() if n.clear and self.weight[k] > LIMITS.small}
+        return {k: n for k, n in self.numbers.items() if n.clear and self.weight[k] > MENTIONED}
 
 
 def regress(y: Array, X: Array, gain: Array, without: Array) -> tuple[Array, Array, Array]:
-    """(beta `[k]`, replicates `[G, k]`, rms of terms `[k]`): y `[W, m]`, X `[W, m, k]`, gain `[W, m, m]`.
+    """Least squares of an estimated force on columns of a true one.
 
-    `without`: `[G, W]`, windows without each condition (`clusters.leave_one_out`).
+    Args:
+        y: `[W, m]`; X: `[W, m, k]`; gain: `[W, m, m]`; without: `[G, W]`, windows without each condition.
+
+    Returns:
+        (beta `[k]`, replicates `[G, k]`, squares `[W]` that are left).
     """
     rows = gain @ X
     scale = np.sqrt(np.mean(rows**2, axis=(0, 1))) + 1e-300
     rows = rows / scale
-    S, g = np.einsum("wmi,wmj->wij", rows, rows), np.einsum("wmi,wm->wi", rows, y)
-    ridge = 1e-6 * np.eye(X.shape[2]) * rows[..., 0].size
-    beta = np.linalg.solve(S.sum(0) + ridge, g.sum(0)) / scale
-    replicates = (
-        np.linalg.solve(np.tensordot(without, S, 1) + ridge, np.tensordot(without, g, 1)[..., None])[..., 0] / scale
-    )
-    term = np.sqrt(np.mean((X * beta) ** 2, axis=(0, 1)))
-    return beta, replicates, term
+    S, g = rows.mT @ rows, statistics.times(rows.mT, y)
+    ridge = np.finfo(np.float32).eps * np.eye(X.shape[2]) * y.size  # against columns that are alike
+    beta = np.linalg.solve(S.sum(0) + ridge, g.sum(0))
+    left = np.sum((y - rows @ beta) ** 2, 1)
+    some = np.linalg.solve(np.tensordot(without, S, 1) + ridge, (without @ g)[..., None])[..., 0]
+    return beta / scale, some / scale, left
 
 
-def _fingerprint(
-    name: str,
-    node: Nodes,
-    y: Array,
-    terms: dict[str, tuple[Array, str]],
-    without: Array,
-) -> Fingerprint:
-    """terms: {name: (column `[W, m]`, unit)}."""
-    X = np.stack([column for column, _ in terms.values()], 2)
-    used = node.used
-    beta, replicates, rms = regress(np.where(used, y, 0.0), X, used[..., None] * node.gain, without)
-    numbers = {
-        key: Number(float(b), *interval(float(b), s), unit)
-        for (key, (_, unit)), b, s in zip(terms.items(), beta, replicates.T, strict=True)
-    }
-    size = max(float(np.sqrt(np.mean(y[node.used] ** 2))) if node.used.any() else 0.0, 1e-300)
-    weight = {key: float(r) / size for key, r in zip(terms, rms, strict=True)}
-    return Fingerprint(name, node.joint, numbers, weight)
-
-
-def fingerprints(
-    fitter: Fitter, fit: Fit, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, without: Array
-) -> list[Fingerprint]:
-    """F1 odd and even in speed, F2 load, F3 lag and speed, F8 time, F10 time since reversal."""
-    w, unit = node.axes["speed"], node.force_unit
-    rate = inputs.angle_unit[dof] + "/s"
+def fingerprints(fitter: Fitter, fit: Fit, inputs: Inputs, dof: int, node: Nodes) -> list[Fingerprint]:
+    """F1 odd and even in speed, F2 load, F8 time, F10 time since reversal, F3 lag and speed of the motion itself."""
+    without = statistics.leave_one_out(fitter.simulator.windows.group)
+    w, unit, angle = node.axes["speed"], node.force_unit, inputs.angle_unit[dof]
     s, one = np.sign(node.axes["direction"]), np.ones_like(w)
-    load = np.abs(node.axes["load"])
-    late = node.axes["time"] - node.axes["time"].mean()
-    recent = np.exp(-node.axes["time since reversal"] / LIMITS.recent)
-    y = node.force
-    slope, square = f"{unit}/({rate})", f"{unit}/({rate})^2"
+    load, since = np.abs(node.axes["load"]), node.axes["time since reversal"]
+    late, recent = node.axes["time"] - node.axes["time"].mean(), float(node.limits("time since reversal")[0])
+    slope, square = f"{unit}/({angle}/s)", f"{unit}/({angle}/s)^2"
     odd = {"offset": (one, unit), "constant": (-s, unit), "linear": (-w, slope), "quadratic": (-w * np.abs(w), square)}
     drift = {"constant": (-s, unit), "friction": (-s * late, f"{unit}/s"), "level": (one, unit)}
     heavy = {"constant": (-s, unit), "linear": (-w, slope)}
@@ -231,28 +176,23 @@ def fingerprints(
         "odd and even in speed": odd | {"even": (-np.abs(w), slope)},
         "load": heavy | {"load": (-s * (load - load.mean()), f"{unit} per {unit}")},
         "time": drift | {"drift": (late, f"{unit}/s")},
-        "time since reversal": {"constant": (-s, unit), "recent": (-s * recent, unit)},
+        "time since reversal": {"constant": (-s, unit), "recent": (-s * (since < recent), unit)},
     }
-    out = [_fingerprint(name, node, y, own, without) for name, own in terms.items()]
+
+    def printed(name: str, own: Mapping[str, tuple[Array, str]], y: Array, gain: Array) -> Fingerprint:
+        X = np.stack([column for column, _ in own.values()], 2)
+        beta, replicates, _ = regress(y, X, gain, without)
+        rows = zip(own.items(), beta, replicates.T, strict=True)
+        numbers = {k: Number(float(b), *statistics.interval(float(b), r), u) for (k, (_, u)), b, r in rows}
+        weight = np.mean((X * beta) ** 2, axis=(0, 1)) / max(float(np.mean(y**2)), 1e-300)
+        return Fingerprint(name, node.joint, numbers, dict(zip(own, map(float, weight), strict=True)), recent)
+
+    out = [printed(name, own, node.force, node.gain) for name, own in terms.items()]
     if not fitter.used[dof]:
         return out  # no measured position that could lag
-    return [*out, _lag(fitter, fit, disturbance, inputs, dof, node, without)]
-
-
-def _lag(
-    fitter: Fitter, fit: Fit, disturbance: Disturbance, inputs: Inputs, dof: int, node: Nodes, without: Array
-) -> Fingerprint:
-    """|error| = c + T |speed|: how far the measured motion lags behind the simulated one (F3)."""
-    linear, own = disturbance.linear, int(fitter.used[:dof].sum())  # its place among the measured channels
-    step = disturbance.values - fit.values
-    dx = step_of_starts(linear, fit, step, np.zeros_like(disturbance.flat))
-    r = linear.r - np.einsum("wns,ws->wn", fit.B, dx) - fit.A @ step
-    windows = fitter.simulator.windows
-    channels = r.reshape(len(r), windows.steps, -1)
-    behind = -channels[..., own] * windows.sigma_q[dof]
-    average = linear.basis / linear.basis.sum(0)
-    one = np.broadcast_to(np.eye(average.shape[1]), node.gain.shape)
-    whole = Nodes(behind @ average, one, node.axes, node.units, node.joint, node.force_unit)
-    angle = inputs.angle_unit[dof]
-    s, w = np.sign(node.axes["direction"]), node.axes["speed"]
-    return _fingerprint("lag", whole, whole.force, {"constant": (s, angle), "lag": (w, "s")}, without)
+    cut, channel = fitter.simulator.windows, int(fitter.used[:dof].sum())
+    behind = -fit.r.reshape(len(fit.r), cut.steps, -1)[..., channel] * cut.sigma_q[dof]
+    nodes = node.force.shape[1]
+    average = np.stack([part.mean(1) for part in np.array_split(behind, nodes, axis=1)], 1)
+    even = np.broadcast_to(np.eye(nodes), node.gain.shape)
+    return [*out, printed("lag", {"constant": (s, angle), "lag": (w, "s")}, average, even)]

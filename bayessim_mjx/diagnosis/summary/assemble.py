@@ -235,7 +235,7 @@ def _flexible(found: Findings) -> dict[str, Any]:
         return {}
     size = found.setup.fitter.size
     levels = [np.nan if f is None else float(np.sqrt(f.condition.cost.mean() / size)) for f in (base, winner)]
-    seeds = np.sqrt(np.maximum(shown.condition.totals.min(1), 0.0) / shown.force.shape[0])
+    seeds = np.sqrt(np.maximum(shown.condition.totals.min(1), 0.0) / len(shown.condition.cost))
     return {
         "depends_on": [{"input": d["input"], "importance": d["importance"]} for d in shown.depends_on],
         "where": residual.flexible(residual.flexible_of(shown, on), found.setup.fitter.simulator.windows.blocks),

@@ -13,7 +13,7 @@ from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.phrases.effects import CLEAR
-from bayessim_mjx.diagnosis.residual.origin import Origin, origin
+from bayessim_mjx.diagnosis.residual.disturbance import Origin, origin
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.numbers import FLOOR, ODDS, RELEVANCE

@@ -6,7 +6,7 @@ import pytest
 from bayessim_mjx.diagnosis.evidence.force_left import force_left
 from bayessim_mjx.diagnosis.evidence.gaussian import learn, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
-from bayessim_mjx.diagnosis.residual import disturbance
+from bayessim_mjx.diagnosis.fitting import forces as disturbance
 from tests.diagnosis.missing_forces import fitted, record
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole fits

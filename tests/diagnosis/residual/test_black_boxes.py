@@ -5,8 +5,6 @@ import pytest
 
 from bayessim_mjx.diagnosis.residual import black_boxes
 from bayessim_mjx.diagnosis.residual.disturbance import estimate
-from bayessim_mjx.diagnosis.residual.motion_inputs import measured
-from bayessim_mjx.diagnosis.residual.regression import Regression
 from tests.diagnosis.missing_forces import fitted, record
 
 
@@ -17,7 +15,7 @@ def rubbing(t, data):
 
 def case(force):
     fitter, fit = fitted(record(force=force, logs=4, seconds=3.0), iterations=4)
-    return fitter, fit, estimate(fitter, fit)
+    return fitter, fit, estimate(fitter, fit).linear
 
 
 @pytest.fixture(scope="module")
@@ -41,28 +39,7 @@ def test_a_law_of_two_terms_is_written_down(rubbed):
 @pytest.mark.ci
 def test_nothing_is_explained_where_nothing_is_missing():
     fitter, fit, missing = case(None)
-    problem = Regression(fitter, fit, missing, measured(fitter.simulator.windows, fitter.simulator.physics.mj_model))
-    fold = fitter.simulator.windows.group
+    problem, fold = black_boxes.Problem(fitter, fit, missing), fitter.simulator.windows.group
     noise = fit.r.size
-    for cost in (black_boxes.network_costs(problem, fold), black_boxes.formula_costs(problem, fold)[0]):
+    for cost in (black_boxes.network(problem, fold), black_boxes.formula(problem, fold)[0]):
         assert 0.8 * noise < cost.sum() < 1.3 * noise
-
-
-@pytest.mark.slow
-@pytest.mark.ci
-def test_the_networks_gradient_is_that_of_its_cost(rubbed, monkeypatch):
-    """By finite differences at a random point: the slope through the columns, parameters eliminated."""
-    fitter, fit, missing = rubbed
-    problem = Regression(fitter, fit, missing, measured(fitter.simulator.windows, fitter.simulator.physics.mj_model))
-    rng, seen = np.random.default_rng(3), []
-
-    def look(cost, start, **_):
-        x, along = start + 0.1 * rng.normal(size=len(start)), rng.normal(size=len(start))
-        sides = [cost(x + h * along)[0] for h in (-1e-5, 1e-5)]
-        seen.append(((sides[1] - sides[0]) / 2e-5, cost(x)[1] @ along))
-        return type("Found", (), {"x": x})
-
-    monkeypatch.setattr(black_boxes, "minimize", look)
-    black_boxes.network_costs(problem, fitter.simulator.windows.group % 2)
-    for differences, gradient in seen:
-        assert gradient == pytest.approx(differences, rel=1e-4)

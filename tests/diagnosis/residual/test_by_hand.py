@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic
-from bayessim_mjx.diagnosis.residual.origin import _white
+from bayessim_mjx.diagnosis.residual.disturbance import _white
 from bayessim_mjx.diagnosis.residual.where import explained
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.phrases.residual import flexible, flexible_of
-from bayessim_mjx.diagnosis.residual import flexible as f
+from bayessim_mjx.diagnosis.residual import black_boxes as f
 from tests.diagnosis.missing_forces import fitted, record
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
@@ -41,7 +41,7 @@ def test_an_effect_outside_of_the_library_is_found_on_other_conditions(outside):
 
 def test_all_seeds_and_ridges_are_reported(outside):
     _, _, found = outside
-    assert found.condition.totals.shape == (5, len(f.RULES.ridges))
+    assert found.condition.totals.shape == (5, len(f.RIDGES))
     assert len(found.condition.totals) == 5
     assert found.condition.cost.sum() == pytest.approx(np.median(found.condition.totals.min(1)), rel=0.5)
 
@@ -50,7 +50,7 @@ def test_it_says_that_it_depends_on_the_direction_of_motion(outside):
     _, _, found = outside
     assert {d["quantity"] for d in found.depends_on[:2]} == {"direction", "speed"}
     assert "direction of motion" in " ".join(flexible(flexible_of(found, "recalibrated")))
-    assert found.where["shoulder"] == 1.0
+    assert found.where["shoulder"] > 0.8  # the rest is gained by parameters that are better with the force
 
 
 def test_nothing_more_than_noise_where_nothing_is_missing():
@@ -89,6 +89,6 @@ def test_a_coupling_between_joints_is_found_where_it_acts():
 def test_blocks_hold_out_times_within_every_log():
     log = np.repeat([0, 1], 8)
     start = np.tile(np.arange(8) * 25, 2)
-    fold = f.blocks(log, start, 50)
-    assert set(fold[:8]) == set(fold[8:]) == {0, 1, 2, 3}
-    assert fold[0] == fold[1] != fold[2]
+    fold = f.blocks(log, start, 25)
+    assert [len(set(fold[own])) for own in (slice(8), slice(8, 16))] == [4, 4]
+    assert fold[0] == fold[1] != fold[2] and fold[0] != fold[8]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from bayessim_mjx.diagnosis.residual.origin import origin
+from bayessim_mjx.diagnosis.residual.disturbance import origin
 
 STEPS, WINDOWS, DT = 40, 40, 0.0125
 

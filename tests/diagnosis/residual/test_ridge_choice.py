@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from bayessim_mjx.diagnosis.residual import flexible
+from bayessim_mjx.diagnosis.residual import black_boxes
 
 
 def test_a_choice_among_ridges_that_do_nothing_gains_nothing():
@@ -13,13 +13,9 @@ def test_a_choice_among_ridges_that_do_nothing_gains_nothing():
     gains, same = [], []
     for _ in range(400):
         costs = 10.0 + np.repeat(rng.normal(size=(1, 5, 6)), 4, axis=2)  # [seeds, ridges, W]
-        run = SimpleNamespace(
-            features=SimpleNamespace(phi=None),
-            without=lambda fold, ridges: range(5),
-            costs=lambda fold, k, phi, costs=costs: costs[0, k],
-        )
+        run = SimpleNamespace(without=lambda fold, ridges: range(5), costs=lambda fold, k, costs=costs: costs[0, k])
         problem = SimpleNamespace(base=lambda fold: np.full(24, 10.0), fitter=SimpleNamespace(size=10))
-        held = flexible._held(problem, {0: run}, fold, (1, 2, 3, 4, 5))
+        held = black_boxes.held_out(problem, [run], fold)
         gains.append(held.gain)
         same.append(240.0 - held.totals.min())
     error = np.std(gains) / np.sqrt(len(gains))

@@ -8,7 +8,7 @@ from bayessim_mjx.diagnosis.phrases.residual import located as located_in_words
 from bayessim_mjx.diagnosis.phrases.residual import places as places_of
 from bayessim_mjx.diagnosis.residual import disturbance, motion_inputs, regions, where
 from bayessim_mjx.diagnosis.residual.where import fingerprints
-from tests.diagnosis.missing_forces import fitted, record
+from tests.diagnosis.missing_forces import fitted, known, record
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
 
@@ -27,8 +27,8 @@ def elbow():
 def backward():
     """A force of 0.06 N m against the motion, only below zero rad."""
     logs = record(force=lambda t, d: np.array([-0.06 * np.tanh(d.qvel[0] / 0.02) * (d.qpos[0] < 0)]), wrong=1.0)
-    fitter, fit = fitted(logs, iterations=0)
-    return fitter, fit, disturbance.estimate(fitter, fit, free=False)
+    fitter, fit = known(logs)
+    return fitter, fit, disturbance.estimate(fitter, fit)
 
 
 def prints(case, dof):
@@ -36,9 +36,7 @@ def prints(case, dof):
     windows = fitter.simulator.windows
     inputs = motion_inputs.measured(windows, fitter.simulator.physics.mj_model)
     node = regions.nodes(found, inputs, dof)
-    return {
-        f.name: f for f in fingerprints(fitter, fit, found, inputs, dof, node, statistics.leave_one_out(windows.group))
-    }
+    return {f.name: f for f in fingerprints(fitter, fit, inputs, dof, node)}
 
 
 def test_the_joint_is_found(elbow):
@@ -127,7 +125,6 @@ def test_bins_without_a_pattern_are_rarely_significant():
         axes = {a: rng.standard_normal((40, 1)) + 0.3 * rng.standard_normal(shape) for a in regions.AXES}
         one = np.broadcast_to(np.eye(10), (40, 10, 10))
         node = regions.Nodes(values, one, axes, dict.fromkeys(axes, ""), "joint", "N m")
-        hits += regions.discoveries(
-            regions.force_map(node, "position", statistics.leave_one_out(np.arange(40)), rng)[1]
-        ).any()
+        _, p = regions.force_map(node, "position", statistics.leave_one_out(np.arange(40)))
+        hits += regions.discoveries(p).any()
     assert hits <= 4
