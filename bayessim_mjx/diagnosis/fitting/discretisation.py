@@ -30,7 +30,11 @@ from bayessim_mjx.physics import Physics
 Array = NDArray[np.float64]
 
 
-FACTORS = (1, 2, 4)  # on the coarsest stable sub-steps: Richardson's method takes three; a search may take any of them
+FACTORS = (
+    1,
+    2,
+    4,
+)  # on the coarsest stable sub-steps: an order and a limit take three (Richardson 1911); any is chosen
 # Noises up to which an error of the time step needs no finer sub-steps: beside it a model is at the noise. And share of
 # the error that the finest have to leave where none is as fine; with contacts it falls with the root of the step
 ENOUGH = float(np.sqrt(AT_NOISE**2 - 1))

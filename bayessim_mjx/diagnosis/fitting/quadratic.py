@@ -22,11 +22,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rules:
-    """How parts of the windows are held out, windows weighed, and columns differenced.
+    """How parts of the windows are held out, windows weighed, and columns differenced. Rules of thumb, not counted.
 
     Attributes:
-        parts: in which windows that alone tell a parameter are held out; a window has as many rows at least. A rule of
-            thumb, as the next two.
+        parts: in which windows that alone tell a parameter are held out; a window has as many rows at least.
         trust: share of the curvature: where no data decide, the fit stays put; first damping of a fit.
         far: standard deviations beyond which nothing is chance: 1 in 16 000 of Gaussian errors.
         change: noise sd, rms by which a finite difference changes the residuals: rounding is 2e-4 to 6e-4; one noise
