@@ -21,9 +21,9 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
+from bayessim_mjx.diagnosis.statistics import root
 
 Array = NDArray[np.float64]
-DRAWS = 8  # from the posterior of the truth's parameters; rule of thumb, not measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,18 +41,17 @@ class Scorer:
     """Evidence of experiments, simulated by the diagnosis' own compiled program.
 
     Attributes:
-        models: rivals; weights: `[M]`; posterior: `[M]` precisions `[k, k]` from the logs; draws: `[M]` of parameters
-            from it; ratio: effective share of samples; misfit: of each model in noise variances.
+        models: rivals; weights: `[M]`; posterior: `[M]` precisions `[k, k]` from the logs; points: `[M]` deviations of
+            parameters that stand for it; ratio: effective share of samples; misfit: of each model in noise variances.
     """
 
-    def __init__(self, setup: Setup, models: Sequence[Model], weights: Array, seed: int = 0) -> None:
+    def __init__(self, setup: Setup, models: Sequence[Model], weights: Array) -> None:
         self.setup, self.fitter, self.models, self.weights = setup, setup.fitter, list(models), weights
         count = models[0].fit.r.size
         self.ratio = np.array([min(m.samples / count, 1.0) for m in models])
         self.misfit = np.array([max(m.total / count, 0.5) for m in models])
         self.posterior = [self._posterior(m, k) for m, k in zip(models, self.ratio / self.misfit, strict=True)]
-        rng = np.random.default_rng(seed)
-        self.draws = [self._draw(i, rng) for i in range(len(models))]
+        self.points = [self._points(i) for i in range(len(models))]
 
     def _posterior(self, model: Model, discount: float) -> Array:
         q, _ = model.fit.quadratic(self.fitter.spread)
@@ -118,11 +117,11 @@ class Scorer:
     def _adapted(self, own: tuple, other: tuple, discount: float, samples: float) -> float:
         """Mean over i's posterior of N/2 log((N + D_ij) / (N + D_ii)), half the difference of the D if they are small.
 
-        D_ij = min over dp of discount |y_i(p_i + dq) - y_j(p_j + dp)|^2 + dp' P_j dp, dq drawn from the posterior that
-        the logs leave of i: how large an effect really is matters, and they may hardly know.
+        D_ij = min over dp of discount |y_i(p_i + dq) - y_j(p_j + dp)|^2 + dp' P_j dp, dq from the posterior that the
+        logs leave of i: how large an effect really is matters, and they may hardly know.
         """
         gains = []
-        for dq in self.draws[own[0]]:
+        for dq in self.points[own[0]]:
             rival, truth = (self._distance(q, dq, k, discount) for k, q in (other, own))
             gains.append(0.5 * samples * np.log((samples + rival) / (samples + truth)))
         return max(float(np.mean(gains)), 0.0)
@@ -137,12 +136,14 @@ class Scorer:
         p = solve(H, pull, low, high)
         return max(discount * rest - 2 * float(pull @ p) + float(p @ H @ p), 0.0)
 
-    def _draw(self, i: int, rng: np.random.Generator) -> Array:
-        """Deviations `[DRAWS, k]` of model i's parameters, in pairs of opposite sign, kept inside their bounds."""
-        covariance = np.linalg.pinv(self.posterior[i])
-        half = rng.multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS // 2, method="eigh")
+    def _points(self, i: int) -> Array:
+        """`[2 k, k]`, deviations of model i's parameters, inside their bounds, whose means are a Gaussian's.
+
+        Exact for polynomials of the third degree (Arasaratnam and Haykin, IEEE Trans. Autom. Control 54, 2009).
+        """
+        half = root(np.asarray(np.linalg.pinv(self.posterior[i]), np.float64)).T * np.sqrt(self.models[i].size)
         _, _, low, high = self.models[i].fit.prior()
-        return np.clip(np.concatenate([half, -half]), low, high)
+        return np.clip(np.concatenate([half, -half]) if len(half) else np.zeros((1, 0)), low, high)
 
     def _sharper(self, S: Array, i: int, discount: float) -> float:
         k = self.models[i].size

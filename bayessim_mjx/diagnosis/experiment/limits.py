@@ -1,4 +1,4 @@
-"""What a robot may do, and how its drives are made to do it.
+"""What a robot may do, how its drives are made to do it, and a menu of motions that excite one joint, or all.
 
 Limits are the model's or given ones, else a little more than the logs already did. A joint that is driven by a torque
 gets a loop around it, as far as the control period allows.
@@ -6,7 +6,7 @@ gets a loop around it, as far as the control period allows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,6 @@ from bayessim_mjx.logs.log import Array, Channels, Log
 from bayessim_mjx.parameters.attributes import suggest
 
 BEYOND = 1.1  # of what the logs already did, where nothing else is said; rule of thumb
-USED = 0.9  # of the allowed range, so that overshoot stays inside; rule of thumb
 BANDWIDTH = 12.0  # rad/s, of the loop around a torque-driven joint; rule of thumb
 _KEYS = {"joints": ("range", "speed"), "actuators": ("command", "effort")}
 
@@ -138,7 +137,7 @@ def middle(limits: Limits, logs: Sequence[Log], model: mujoco.MjModel) -> tuple[
         width = limits.high[v] - limits.low[v]
         if np.isfinite(width):
             start[q] = np.clip(seen, limits.low[v] + 0.3 * width, limits.high[v] - 0.3 * width)
-            half[v] = USED * min(limits.high[v] - start[q], start[q] - limits.low[v])
+            half[v] = min(limits.high[v] - start[q], start[q] - limits.low[v])
     return start, half
 
 
@@ -206,3 +205,138 @@ def _drive(model: mujoco.MjModel, i: int, law: Any) -> tuple[str, int, float]:
     if b[2]:
         return "velocity", j, float(-b[2] * gear / gain / scale)
     return "torque", j, 1.0 / (gain * gear * scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """One motion of the menu.
+
+    Attributes:
+        kind: its name in the menu; where: joint, or "all".
+        offset: `[T, nv]`, reference motion relative to the middle position, at full amplitude.
+        live: `[T, nv]`, 0 while the joint's drive is to be off.
+        sharp: jumps are meant, and not smoothed away.
+    """
+
+    kind: str
+    where: str
+    offset: Array
+    live: Array
+    sharp: bool = False
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind} on {'all joints together' if self.where == 'all' else self.where}"
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """What motions have: time `[T]` s, and of each degree of freedom `[nv]` the usable half range and largest speed."""
+
+    time: Array
+    half: Array
+    speed: Array
+
+
+def menu(room: Room, joints: Mapping[str, int], alone: Sequence[str], release: Sequence[str]) -> list[Excitation]:
+    """Every kind of motion on single joints, and on all together.
+
+    Slow triangles show dry friction and play, staircases of speeds what grows with speed, chirps and multisines timing
+    and inertia, steps the limits of drives and deadbands, fast strokes the speed-torque curve.
+
+    Args:
+        joints: {name: dof} that are concerned; alone: names of those moved one at a time.
+        release: names of the joints whose drive can be switched off.
+    """
+    places = [*alone, *(["all"] if len(joints) > 1 else [])]
+    each = [(kind, place) for kind in SHAPES for place in places if kind != RELEASE or place in release]
+    return [_of(kind, place, room, joints) for kind, place in each]
+
+
+def _of(kind: str, place: str, room: Room, joints: Mapping[str, int]) -> Excitation:
+    time, shape = room.time, (len(room.time), len(room.half))
+    offset, live = np.zeros(shape), np.ones(shape)
+    own = joints if place == "all" else {place: joints[place]}
+    for k, v in enumerate(own.values()):
+        # together, each joint at a pace of its own, so that their motions are not alike
+        pace = 1.0 if len(own) == 1 else 0.55 + 0.45 * ((k * 0.618) % 1.0)
+        reach = room.half[v] if len(own) == 1 else 0.7 * room.half[v]
+        offset[:, v] = SHAPES[kind](time, reach, pace * room.speed[v])
+        if kind == RELEASE:
+            live[:, v] = np.mod(time, time[-1] / 3) < 0.6 * time[-1] / 3
+    return Excitation(kind, place, offset, live, SHAPES[kind] is _steps)
+
+
+def _triangle(way: Array, a: float) -> Array:
+    """Position `a`-bounded after a way travelled back and forth, starting in the middle."""
+    return 2 * a / np.pi * np.arcsin(np.sin(np.pi / 2 * way / a))
+
+
+def _slow(t: Array, a: float, v: float) -> Array:
+    return _triangle(max(0.06 * v, 1.5 * a / t[-1]) * t, a)
+
+
+def _staircase(t: Array, a: float, v: float) -> Array:
+    level = np.array([0.06, 0.12, 0.25, 0.5, 0.85])[np.minimum((5 * t / t[-1]).astype(int), 4)]
+    return _triangle(np.cumsum(level * v) * (t[1] - t[0]), a)
+
+
+def _strokes(t: Array, a: float, v: float) -> Array:
+    """At top speed from end to end with a rest of 0.2 s at every turn."""
+    stroke, dt = 2 * a / (0.9 * v), t[1] - t[0]
+    moving = np.mod(t + stroke / 2, stroke + 0.2) < stroke
+    return _triangle(np.cumsum(0.9 * v * moving) * dt, a)
+
+
+def _fastest(t: Array) -> float:
+    """Hz, the highest frequency to be sent."""
+    return float(min(8.0, 0.1 / (t[1] - t[0])))
+
+
+def _chirp(t: Array, a: float, v: float) -> Array:
+    low, high = 0.15, _fastest(t)
+    f = low * (high / low) ** (t / t[-1])
+    phase = 2 * np.pi * np.concatenate([[0.0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(t))])
+    return np.minimum(0.8 * a, 0.7 * v / (2 * np.pi * f)) * np.sin(phase)
+
+
+def _multisine(t: Array, a: float, v: float) -> Array:
+    """With phases that keep its peaks low (Schroeder, IEEE Trans. Inf. Theory 16, 1970)."""
+    f = np.round(np.geomspace(0.2, _fastest(t), 10) * t[-1]) / t[-1]
+    lines = np.sin(2 * np.pi * np.outer(t, f) - np.pi * np.arange(len(f)) ** 2 / len(f)) / f**0.8
+    x = lines.sum(1) - lines[0].sum()
+    return x * min(0.8 * a / np.abs(x).max(), 0.8 * v / np.abs(np.gradient(x, t)).max())
+
+
+def _steps(t: Array, a: float, v: float) -> Array:
+    levels = a * np.array([0.0, 0.15, -0.15, 0.4, -0.4, 0.8, -0.8, 0.0])
+    wanted, out = levels[np.minimum((8 * t / t[-1]).astype(int), 7)], np.zeros(len(t))
+    reach = 0.9 * v * (t[1] - t[0])
+    for k in range(1, len(t)):
+        out[k] = out[k - 1] + np.clip(wanted[k] - out[k - 1], -reach, reach)
+    return out
+
+
+def _through(*levels: float) -> Callable[[Array, float, float], Array]:
+    """In straight lines from level to level, shares of the range."""
+    return lambda t, a, v: np.interp(t, np.linspace(0, t[-1], len(levels)), a * np.array(levels))
+
+
+def _reversals(t: Array, a: float, v: float) -> Array:
+    """Small slow strokes that grow from 1 % to 12 % of the range: presliding, play and deadband."""
+    size = a * 0.01 * 12 ** (t / t[-1])
+    return size * _triangle(4 * t, 1.0)
+
+
+RELEASE = "hold and release"
+SHAPES: dict[str, Callable[[Array, float, float], Array]] = {
+    "slow triangle": _slow,
+    "staircase of speeds": _staircase,
+    "chirp": _chirp,
+    "multisine": _multisine,
+    "steps of three sizes": _steps,
+    "ramps and holds": _through(*np.repeat([0.0, 0.45, 0.9, 0.45, 0.0, -0.45, -0.9, -0.45], 2).tolist()),
+    "small reversals": _reversals,
+    RELEASE: _through(0.0, 0.35, 0.35, -0.6, -0.6, 0.85, 0.85),
+    "fast driving and braking": _strokes,
+}

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.experiment.design import Scored, Scorer
-from bayessim_mjx.diagnosis.experiment.excitation import Excitation, Room, menu
-from bayessim_mjx.diagnosis.experiment.limits import Drives, Limits, limits_of
+from bayessim_mjx.diagnosis.experiment.limits import Drives, Excitation, Limits, Room, limits_of, menu
 from bayessim_mjx.diagnosis.experiment.rehearsal import Played, Rehearsal
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.phrases import experiment as phrases
 from bayessim_mjx.diagnosis.phrases.effects import all_of
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model, nats
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS
 from bayessim_mjx.diagnosis.selection.search_state import ranked
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.effects.support.bodies import tilted
@@ -32,24 +32,20 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Budget:
-    """What a proposal may cost, how many experiments are looked at, and when one is of use.
+class Size:
+    """Of a proposal. Rules of thumb, not measured.
 
-    Rules of thumb, not measured, but for `nothing`: below it evidence is not worth more than a bare mention (Kass and
-    Raftery 1995, 2 ln B < 2).
+    Attributes:
+        seconds: of an experiment; models: that are compared; final: experiments that are looked at in full.
     """
 
     seconds: float = 10.0
-    most: int = 4  # models compared
-    nothing: float = 1.0  # nats: less separates no models
-    mild: float = 10.0  # nats: below, evidence between two models is called a tie
-    budget: int = 6000  # windows simulated for a first look at the whole menu
-    final: int = 3  # experiments looked at in full
-    weight: float = 0.1  # least share of a surviving model
-    alone: int = 2  # joints that are moved one at a time where more are concerned
+    models: int = 4
+    final: int = 3
 
 
-BUDGET = Budget()
+SIZE = Size()
+MENTION, STRONG = math.log(ODDS.mention), math.log(ODDS.strong)  # nats: less separates no models, is called a tie
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +75,8 @@ class Experiment:
 
     def to_dict(self, file: str = "") -> dict[str, Any]:
         """For diagnosis.json."""
-        own = {
-            k: getattr(self, k) for k in ("name", "why", "evidence", "pairs", "table", "needs", "witnesses", "unsafe")
-        }
-        return own | {"file": file if self.chosen is not None else ""}
+        names = ("name", "why", "evidence", "pairs", "table", "needs", "witnesses", "unsafe")
+        return {k: getattr(self, k) for k in names} | {"file": file if self.chosen is not None else ""}
 
     def details(self) -> list[dict[str, Any]]:
         """For the report: [{"name", "evidence", "pairs", "command": {"time", "ctrl": {actuator: values}}}]."""
@@ -110,22 +104,22 @@ def propose(
         rivals_models: models to be told from the winner; None: its rivals, and without any the closest losers.
         limits: see `limits.limits_of`.
     """
-    setup, seed = found.setup, found.setup.seed
+    setup = found.setup
     cut, model = setup.fitter.simulator.windows, setup.physics.mj_model
     models, contested = _contenders(found.selection, rivals_models)
     known = found.selection.weighed.weight
     weights = np.array([known.get(frozenset(c.label for c in m.effects), 0.0) for m in models])
-    weights = np.maximum(weights / max(weights.sum(), 1e-300), BUDGET.weight)
-    scorer = Scorer(setup, models, weights, seed)
+    weights = np.maximum(weights / max(weights.sum(), 1e-300), 1 / ODDS.strong)  # else it were no rival
+    scorer = Scorer(setup, models, weights)
     allowed = limits_of(model, cut.logs, limits)
-    rows = max(cut.steps, int(round(BUDGET.seconds / cut.dt)) // cut.steps * cut.steps)
+    rows = max(cut.steps, int(round(SIZE.seconds / cut.dt)) // cut.steps * cut.steps)
     time = np.asarray(cut.dt * np.arange(rows), np.float64)
     effects = {c.effect for m in models for c in m.effects} | {"payload", "gravity_tilt"}
     stand = Rehearsal(setup, effects, time, allowed)
     joints = _touched(stand.drives.joints(), models, model)
-    loaded = sorted(joints, key=lambda n: -setup.scales.force[joints[n]])[: BUDGET.alone]
+    loaded = sorted(joints, key=lambda n: -setup.scales.force[joints[n]])[: max(len(models) - 1, 1)]  # one per rival
     room = Room(time, stand.half, allowed.speed)
-    every = menu(room, joints, loaded, stand.release, seed) if joints else []
+    every = menu(room, joints, loaded, stand.release) if joints else []
     scored = _look(scorer, stand, every)
     attended = _with_help(scorer, stand, scored, model)
     final = _in_full(scorer, stand, scored, attended)
@@ -139,13 +133,11 @@ def _contenders(of: Selection, given: Sequence[Model] | None) -> tuple[list[Mode
     found = [r.model for rivals in of.rivals.values() for r in rivals if not r.contains] if given is None else given
     found = list({id(m): m for m in found if m is not of.answer}.values())
     if found:
-        return [of.answer, *found[: BUDGET.most - 1]], True
+        return [of.answer, *found[: SIZE.models - 1]], True
     own = {c.effect for c in of.answer.effects}
     losers = [m for m in ranked(of.state) if m is not of.answer and not {c.effect for c in m.effects} & own]
-    close = [m for m in losers if abs(nats(m, of.answer)) < 3 * BUDGET.mild and (m.effects or own)]
-    if not of.answer.effects:  # nothing is wrong as far as these logs can tell: what could still hide?
-        close = close[:2]
-    return [of.answer, *close[: BUDGET.most - 2]], False
+    close = [m for m in losers if abs(nats(m, of.answer)) < EFFORT.margin and (m.effects or own)]
+    return [of.answer, *close[: SIZE.models - 2]], False
 
 
 def _touched(joints: dict[str, int], models: Sequence[Model], model: Any) -> dict[str, int]:
@@ -173,13 +165,12 @@ def _thetas(scorer: Scorer, shift: Array) -> Array:
 
 
 def _look(scorer: Scorer, stand: Rehearsal, every: Sequence[Excitation]) -> list[Scored]:
-    """A first look at the whole menu, on as many windows as the budget allows, best first."""
+    """A first look at the whole menu, on about as many windows as the logs have, best first."""
     shift = np.zeros(len(scorer.fitter.theta))
     played = [p for p in stand.play(every, _thetas(scorer, shift)) if p.safe] if every else []
     if not played:
         return []
-    columns = sum(1 + m.size + 2 * scorer.fitter.simulator.nv for m in scorer.models)
-    each = int(np.clip(BUDGET.budget / (columns * len(played)), 2, stand.count))
+    each = int(np.clip(len(scorer.fitter.simulator.windows) // len(played), 2, stand.count))
     pairs = scorer.score(played, shift, each)
     return sorted((_scored(scorer, p, e) for p, e in zip(played, pairs, strict=True)), key=lambda s: -s.evidence)
 
@@ -206,7 +197,7 @@ def _in_full(scorer: Scorer, stand: Rehearsal, scored: list[Scored], attended: l
     """The best ones on all of their windows."""
     if not scored:
         return []
-    best = [s.played for s in scored[: BUDGET.final]]
+    best = [s.played for s in scored[: SIZE.final]]
     pairs = scorer.score(best, np.zeros(len(scorer.fitter.theta)), stand.count)
     exact = [_scored(scorer, p, e) for p, e in zip(best, pairs, strict=True)]
     return sorted([*exact, *attended[:2]], key=lambda s: -s.evidence)
@@ -217,11 +208,9 @@ def _decide(scorer: Scorer, stand: Rehearsal, final: list[Scored], looked: list[
     alone = [s for s in final if not s.needs]
     chosen = alone[0] if alone else None
     helped = next((s for s in final if s.needs), None)
-    if helped and (
-        chosen is None or (chosen.evidence < BUDGET.mild and helped.evidence > 1.5 * chosen.evidence + BUDGET.nothing)
-    ):
+    if helped and (chosen is None or (chosen.evidence < STRONG and helped.evidence > chosen.evidence + STRONG)):
         chosen = helped
-    useful = chosen is not None and (chosen.evidence > BUDGET.nothing or (len(labels) == 1 and chosen.evidence > 0.1))
+    useful = chosen is not None and chosen.evidence > (MENTION if len(labels) > 1 else 0.1)
     why = reason(scorer, chosen, labels, contested, useful)
     kept = {s.name for s in final}
     everything = sorted([*final, *(s for s in looked if s.name not in kept)], key=lambda s: -s.evidence)
@@ -251,7 +240,6 @@ def _named(pairs: Array, labels: Sequence[str]) -> list[dict[str, Any]]:
     ]
 
 
-PAYLOAD_SHARE = 0.5  # of the largest payload that the body is thought to carry; rule of thumb, not measured
 STANDING = (("turned on its side (90 degrees about the world's x axis)", (math.pi / 2, 0.0)),
             ("turned forward (90 degrees about the world's y axis)", (0.0, math.pi / 2)))  # fmt: skip
 
@@ -273,7 +261,7 @@ def helps(setup: Setup) -> list[Help]:
         *_, last = physics.blocks_of(effect)
         if effect.name == "payload":
             place, own = last.place, last.parameters[0]
-            mass = float(f"{PAYLOAD_SHARE * own.high:.2g}")
+            mass = float(f"{(own.low + own.high) / 2:.2g}")
             shift = np.zeros(len(physics.space))
             shift[last.start] = mass
             out.append(Help(*phrases.known_payload(mass, place), shift))
@@ -318,4 +306,4 @@ def reason(scorer: Scorer, chosen: Scored | None, labels: Sequence[str], contest
         return phrases.sharpens(action, *change) if useful else phrases.sharpens_little(chosen.name, *change)
     if not useful:
         return phrases.separates_nobody(labels, chosen.name, chosen.evidence, instead(scorer.models))
-    return phrases.tells_apart(action, labels, chosen.evidence, contested, BUDGET.mild)
+    return phrases.tells_apart(action, labels, chosen.evidence, contested, STRONG)

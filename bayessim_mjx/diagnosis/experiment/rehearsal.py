@@ -13,10 +13,11 @@ import mujoco
 import numpy as np
 from flax import struct
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from bayessim_mjx.compat import compiler_options
-from bayessim_mjx.diagnosis.experiment.excitation import Excitation
-from bayessim_mjx.diagnosis.experiment.limits import Limits, drives_of, middle
+from bayessim_mjx.diagnosis.experiment.limits import Excitation, Limits, drives_of, middle
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Drive, Physics, control_step
@@ -24,16 +25,6 @@ from bayessim_mjx.physics import Drive, Physics, control_step
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Rules:
-    """How an experiment is rehearsed and made smaller until it keeps its limits. Rules of thumb, not measured."""
-
-    lanes: int = 32  # worlds in one call; the results do not depend on it
-    rounds: int = 5  # of making an experiment smaller until it is safe
-    shrink: float = 0.7  # a round: more than what is over, since a part of it does not shrink along (gravity)
-
-
-RULES = Rules()
 KEPT = 1.0 + 10.0 * float(np.finfo(np.float32).eps)  # share of a limit that may be used: all of it, but for rounding
 
 
@@ -81,6 +72,7 @@ class Rehearsal:
         self.start, self.half = middle(limits, windows.logs, model)
         self.can_switch = windows.batch.enabled is not None
         self.rest = np.median(np.concatenate([log.ctrl for log in windows.logs]), axis=0)
+        self.lanes = 0
         self._run = jax.jit(jax.vmap(self._one), compiler_options=compiler_options())
 
     @property
@@ -123,7 +115,7 @@ class Rehearsal:
         """
         scale, done = np.ones(len(excitations)), {}
         left = list(range(len(excitations)))
-        for _ in range(RULES.rounds):
+        for _ in range(EFFORT.rounds):
             plans = [self._plan(excitations[k], scale[k], gravity) for k in left]
             runs = self._simulate(plans, thetas)
             for k, own in zip(left, runs, strict=True):
@@ -131,7 +123,8 @@ class Rehearsal:
                 log = self._log(excitations[k], *own[0])
                 done[k] = Played(excitations[k], float(scale[k]), log, worst, worst <= KEPT)
             left = [k for k in left if not done[k].safe]
-            scale[left] *= RULES.shrink
+            # by more than what is over, since a part does not shrink along (gravity); motion that diverged by a half
+            scale[left] *= [max(done[k].worst ** -2, 0.5) for k in left]
             if not left:
                 break
         return [done[k] for k in range(len(excitations))]
@@ -142,9 +135,10 @@ class Rehearsal:
         stacked = jax.tree.map(lambda *x: np.stack(x), *plans)
         small = np.asarray(thetas[:, self.kept], np.float32)
         out: list[list[tuple]] = [[] for _ in plans]
-        for a in range(0, len(pairs), RULES.lanes):
-            some = pairs[a : a + RULES.lanes]
-            padded = some + [some[-1]] * (RULES.lanes - len(some))
+        self.lanes = self.lanes or len(pairs)  # the first call's, the largest one: no other size is compiled
+        for a in range(0, len(pairs), self.lanes):
+            some = pairs[a : a + self.lanes]
+            padded = some + [some[-1]] * (self.lanes - len(some))
             index = np.array([p for p, _ in padded])
             chosen = Plan(**{f.name: getattr(stacked, f.name)[index] for f in fields(Plan)})
             rows, ends = self._run(small[[m for _, m in padded]], chosen)
@@ -246,7 +240,4 @@ def _columns(physics: Physics, effects: set[str]) -> tuple[NDArray[np.int64], li
 def _rounded(x: Array, width: float, dt: float) -> Array:
     """Moving average over `width` s, twice half of it, ends held: a jump of the speed becomes a ramp."""
     rows = max(1, int(round(width / 2 / dt)))
-    for _ in range(2):
-        ends = np.pad(x, (rows // 2, rows - 1 - rows // 2), mode="edge")
-        x = np.convolve(ends, np.ones(rows) / rows, mode="valid")
-    return x
+    return np.asarray(uniform_filter1d(uniform_filter1d(x, rows, mode="nearest"), rows, mode="nearest"))
