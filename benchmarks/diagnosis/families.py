@@ -12,6 +12,7 @@ FAMILIES = (
     # a sine of the angle at order 1 is what gravity does to one joint
     ("payload", "gravity_tilt", "external_force", "joint_spring", "joint_offset", "actuator_bias", "cogging",
      "gravity_compensation", "cable_tension", "inertial_parameters"),
+    ("servo_stiffness", "servo_damping", "actuator_gain", "viscous_friction", "joint_spring"),
     ("actuator_gain", "sensor_gain", "armature", "payload", "actuator_saturation", "effort_loss", "speed_torque_limit",
      "gain_drift", "inertial_parameters", "effort_coupling"),
     ("contact_friction", "contact_compliance", "ground_height"),

@@ -158,7 +158,7 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     (
         "what was not calibrated gets a twelfth of its range as width", f"{DIAGNOSIS}/correction.py",
-        "(p.high - p.low) / math.sqrt(12) if", "(p.high - p.low) / 12 if",
+        "UNIFORM * (p.high - p.low) if", "UNIFORM**2 * (p.high - p.low) if",
         _tests("diagnosis/test_correction", k="as_wide"),
     ),
     (
@@ -166,7 +166,7 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         "drop = d * (g -", LEFT,
     ),
     (
-        "white noise from second differences by 4, not 6", f"{DIAGNOSIS}/residual/origin.py",
+        "white noise from second differences by 4, not 6", f"{DIAGNOSIS}/residual/disturbance.py",
         "np.diff(r, 2, axis=1) ** 2 / 6.0", "np.diff(r, 2, axis=1) ** 2 / 4.0", LEFT,
     ),
     # logs
@@ -175,7 +175,7 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
         RESAMPLE,
     ),
     (
-        "commands that run linearly rise twice as fast", f"{LOGS}/commands.py", "since + 0.5 * slope[at] * since**2",
+        "commands that run linearly rise twice as fast", f"{LOGS}/resample.py", "since + 0.5 * slope[at] * since**2",
         "since + slope[at] * since**2", _tests("logs/test_as_they_are"),
     ),
     (
