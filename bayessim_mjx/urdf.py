@@ -17,7 +17,7 @@ _PACKAGE = re.compile(r"package://([^/\"']+)/([^\"']+)")
 
 
 def read(path: Path, packages: Sequence[str] = ()) -> mujoco.MjSpec:
-    """The specification of an MJCF or URDF file; `package://NAME/...` is looked up in `packages` and above the file.
+    """Read the specification of an MJCF or URDF file; `package://NAME/...` is sought in `packages` and above the file.
 
     Args:
         packages: `NAME=FOLDER`, or a folder that has folders of these names.

@@ -68,7 +68,7 @@ def declared(metadata: Mapping[str, Any]) -> bool:
 
 
 def read(metadata: Mapping[str, Any], model: mujoco.MjModel, actuators: Sequence[str], source: str) -> Law:
-    """The law of one log: `controller: {law, kp, kd, limit, scale}`, numbers or one per actuator by name.
+    """Return the law of one log: `controller: {law, kp, kd, limit, scale}`, numbers or one per actuator by name.
 
     Args:
         metadata: of the log.
@@ -106,7 +106,7 @@ def read(metadata: Mapping[str, Any], model: mujoco.MjModel, actuators: Sequence
 
 
 def of_logs(logs: Sequence[Any], model: mujoco.MjModel) -> Law | None:
-    """The laws of several logs, leaves `[logs, nu]`; None where all commands go to the actuators as they are.
+    """Return the laws of several logs, leaves `[logs, nu]`; None where all commands go to the actuators as they are.
 
     Raises:
         UserError: as `read`.

@@ -15,7 +15,7 @@ Carry = TypeVar("Carry")
 
 
 def gated(active: jax.Array | None, index: int, hook: Callable[[], T], otherwise: T) -> T:
-    """What the hook of effect `index` returns; `otherwise`, its inputs, where the effect is not active.
+    """Return the output of the hook of effect `index`; `otherwise`, its inputs, where the effect is not active.
 
     At neutral numbers both are the same. `active` `[effects]` is one for all worlds of a call: under `vmap` the branch
     stays a branch, and effects that no world has cost nothing. None: all of them are computed.

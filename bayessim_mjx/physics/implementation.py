@@ -66,13 +66,13 @@ def installed() -> bool:
 
 
 def kind() -> str:
-    """The kind of the default device, as JAX calls it."""
+    """Return the kind of the default device, as JAX calls it."""
     chosen = getattr(jax.config, "jax_default_device", None)  # a device, the name of a platform, or None
     return chosen.device_kind if isinstance(chosen, jax.Device) else jax.devices(chosen)[0].device_kind
 
 
 def _kept() -> tuple[measured.Measurement, ...]:
-    """What was measured; a file that is damaged is no reason to stop a training."""
+    """Return the measurements; a file that is damaged is no reason to stop a training."""
     try:
         return measured.read(measured.path())
     except UserError as error:

@@ -43,7 +43,7 @@ class Measurement:
 
 
 def rate(value: float) -> str:
-    """Steps per second in few characters: `3848`, `655k`, `4.82M`."""
+    """Return steps per second in few characters: `3848`, `655k`, `4.82M`."""
     return compact(value, 3 if value >= 1e4 else 4)
 
 
@@ -54,7 +54,7 @@ def path() -> Path | None:
 
 
 def read(file: Path | None) -> tuple[Measurement, ...]:
-    """The measurements in `file`; none where there is no file.
+    """Return the measurements in `file`; none where there is no file.
 
     Raises:
         UserError: it cannot be read, or holds something else.
@@ -80,13 +80,13 @@ def _checked(m: Measurement) -> Measurement:
 
 
 def content(kept: Iterable[Measurement]) -> dict[str, Any]:
-    """What the file holds."""
+    """Return the content of the file."""
     ordered = sorted(kept, key=lambda m: (m.task, m.device, m.worlds))
     return {"format": FORMAT, "measured": [dataclasses.asdict(m) for m in ordered]}
 
 
 def with_new(kept: Iterable[Measurement], new: Measurement) -> tuple[Measurement, ...]:
-    """The measurements with a further one, in place of what was measured for the same before."""
+    """Return the measurements with a further one, in place of what was measured for the same before."""
     same = (new.task, new.device, new.worlds)
     return (*(m for m in kept if (m.task, m.device, m.worlds) != same), new)
 

@@ -117,7 +117,7 @@ class Physics:
         return tuple(block for block in self.blocks if block.effect is effect)
 
     def quantity(self, index: int) -> Quantity:
-        """What its effect says of the number at `index` of theta."""
+        """Return the quantity of its effect for the number at `index` of theta."""
         return next(b.quantities[index - b.start] for b in self.blocks if b.start <= index < b.stop)
 
     @property
@@ -132,7 +132,7 @@ class Physics:
         return np.stack(each, 1) if each else moved[:, :0]
 
     def world(self, theta: jax.Array, qpos: jax.Array | None = None, qvel: jax.Array | None = None) -> World:
-        """A world at the start of an episode, as the sensors show it at rest; writes `theta` into the model once.
+        """Begin a world at the start of an episode, as the sensors show it at rest; writes `theta` into the model once.
 
         Args:
             theta: `[d]`, values of `self.space`.
@@ -200,7 +200,7 @@ class Physics:
         return chained_in(active, self.having("on_measurement"), hook, memory, true)
 
     def having(self, hook: str) -> list[int]:
-        """Indices of the effects that have this hook."""
+        """Return indices of the effects that have this hook."""
         return [i for i, effect in enumerate(self.effects) if overrides(effect, hook)]
 
     def encoders(
@@ -214,7 +214,7 @@ class Physics:
         return shown["qpos"], shown["qvel"]
 
     def model_of(self, world: World) -> mjx.Model:
-        """The model with this world's parameters."""
+        """Return the model with this world's parameters."""
         return self.model.tree_replace(world.fields) if world.fields else self.model
 
     def data_of(self, world: World) -> mjx.Data:

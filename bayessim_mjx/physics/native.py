@@ -52,7 +52,7 @@ class PolynomialForces(Effect):
 
 
 def own_forces(model: mujoco.MjModel) -> tuple[Effect, ...]:
-    """The forces of a model's joints that MJX leaves out, as an effect that is always on; none of most models."""
+    """Return the forces of a model's joints that MJX leaves out, as an effect that is always on; mostly none."""
     return (PolynomialForces(),) if _polynomial(model).any() else ()
 
 

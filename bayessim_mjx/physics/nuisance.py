@@ -83,7 +83,7 @@ class Noise:
     schedule: Schedule
 
     def bias(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-        """A draw of the lasting part; `[0]` where there is none."""
+        """Return a draw of the lasting part; `[0]` where there is none."""
         return jnp.zeros((0,)) if self.lasting is None else self.lasting.draw(key, shape)
 
     def apply(self, key: jax.Array, x: jax.Array, bias: jax.Array, clock: jax.Array) -> jax.Array:
@@ -151,7 +151,7 @@ class Nuisance:
         return drawn.replace(key=key), noisy
 
     def after_step(self, drawn: Drawn) -> Drawn:
-        """The counters one control step on; they stop before they overflow."""
+        """Move the counters one control step on; they stop before they overflow."""
         course = drawn.course
         later = {name: jnp.minimum(getattr(course, name) + 1, OVER) for name in ("clock", "age")}
         return drawn.replace(course=course.replace(**later))
@@ -164,7 +164,7 @@ def starting(clock: Any, worlds: int) -> Course:
 
 
 def read(section: Mapping[str, Any], space: ParameterSpace) -> Nuisance | None:
-    """The nuisances of `randomization_params`; None where there are none, and no parameter of `space` has a schedule.
+    """Return the nuisances of `randomization_params`; None without any, and without a schedule in `space`.
 
     Raises:
         UserError: naming the key's path, its value and what is allowed.

@@ -24,7 +24,7 @@ def apart(physics: Physics, forces: jax.Array) -> tuple[jax.Array, ...]:
 
 
 def together(physics: Physics, rows: tuple[jax.Array, ...]) -> jax.Array:
-    """The inverse of `apart`."""
+    """Return the inverse of `apart`."""
     nothing = jnp.zeros(physics.mj_model.nv)
     each = dict(zip(physics.having("on_force"), rows, strict=True))
     every = [each.get(i, nothing) for i in range(len(physics.effects))]
@@ -34,7 +34,7 @@ def together(physics: Physics, rows: tuple[jax.Array, ...]) -> jax.Array:
 def pushed(
     physics: Physics, thetas: tuple[jax.Array, ...], drive: Drive, data: mjx.Data, carry: Memory, step: SubStep
 ) -> tuple[mjx.Data, Memory]:
-    """The sum of the effects' own forces in qfrc_applied.
+    """Return the sum of the effects' own forces in qfrc_applied.
 
     Each effect sees the newest forces of the others (Gauss-Seidel). They start from those of the last sub-step, so that
     dry friction in several coupled joints settles to sticking.

@@ -98,7 +98,7 @@ def _timesteps(
     seen: dict[str, jax.Array],
     drive: Drive,
 ) -> tuple[mjx.Data, Memory]:
-    """(data, (memories, forces)) after a timestep for each row of commands; see `substep`."""
+    """Return (data, (memories, forces)) after a timestep for each row of commands; see `substep`."""
 
     def body(carry: tuple, row: tuple) -> tuple[tuple, None]:
         data, own = carry
@@ -143,7 +143,7 @@ def _refuse(physics: Physics, drive: Drive) -> None:
 
 
 def begin(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array | None = None) -> World:
-    """A world in the middle of a log: effects' memories filled by the recorded past, sensors' effects undone.
+    """Return a world in the middle of a log: effects' memories filled by the recorded past, sensors' effects undone.
 
     What follows the motion (`Effect.follows`) remembers nothing here; `retraced` takes it through the past.
 
@@ -156,7 +156,7 @@ def begin(physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array 
 def _begun(
     physics: Physics, theta: jax.Array, motion: Motion, active: jax.Array | None, fields: dict | None = None
 ) -> tuple[World, Motion]:
-    """The world that `begin` gives, and the true motion around its start; fields: the world's, where they are known."""
+    """Return the world that `begin` gives, and the true motion around its start; fields: the world's, where known."""
     shown = motion.qpos[motion.start], motion.qvel[motion.start]  # what was measured
     world = physics.unseen(theta, *shown, fields)
     thetas, memory = physics.split(world.theta)[1], list(world.memory)
@@ -194,7 +194,7 @@ class Past(struct.PyTreeNode):
         return jnp.where(self.wanted, 0, self.steps) if self.steps else 0
 
     def led(self, k: jax.Array, world: World) -> World:
-        """What control step k begins with; from `steps` on it is simulated freely, from the start.
+        """Begin control step k; from `steps` on it is simulated freely, from the start.
 
         Args:
             k: one for all worlds of a call, so that under `vmap` a branch stays a branch.
@@ -211,7 +211,7 @@ class Past(struct.PyTreeNode):
         return jax.lax.cond(k < self.steps, along, lambda: jax.lax.cond(k == self.steps, arrived, lambda: world))
 
     def arrived(self, world: World) -> World:
-        """The start with the memory of what followed the motion up to it; world: after the last step."""
+        """Return the start with the memory of what followed the motion up to it; world: after the last step."""
 
         def kept(new: jax.Array, old: jax.Array) -> jax.Array:
             return jnp.where(self.wanted, new, old)
@@ -232,7 +232,7 @@ class Past(struct.PyTreeNode):
 
 
 def past_of(physics: Physics, start: World, motion: Motion, active: jax.Array | None = None) -> Past:
-    """What leads up to the start that `begin` gives for its theta and the same `motion` and `active`."""
+    """Return the motion up to the start that `begin` gives for its theta and the same `motion` and `active`."""
     follows = np.array([effect.follows for effect in physics.effects], bool)
     if not follows.any() or not motion.start:
         return Past(physics, start, start, motion, 0, jnp.array(False))

@@ -65,7 +65,7 @@ class Timestep:
         return [(i, physics.effects[i], physics.sites[i], self.thetas[i]) for i in physics.having(hook)]
 
     def view(self, data: mjx.Data, **known: Any) -> SubStep:
-        """The timestep as effects see it."""
+        """Return the timestep as effects see it."""
         return SubStep(self.model, data, self.seen, float(self.physics.mj_model.opt.timestep), **known)
 
     @property
@@ -131,7 +131,7 @@ def _accelerated(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _actuated(own: Timestep, data: mjx.Data, memory: tuple) -> tuple[mjx.Data, tuple, SubStep]:
-    """The actuators' forces as effects and drives leave them. Returns (data, memory, the timestep as seen)."""
+    """Return the actuators' forces as effects and drives leave them. Returns (data, memory, the timestep as seen)."""
     model, before = own.model, memory
     data = plain = mjx.fwd_actuation(model, data.replace(ctrl=_within_range(own, data.ctrl)))
     if not model.nu or int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION):
@@ -220,7 +220,7 @@ def _response(own: Timestep, plain: mjx.Data, acting: jax.Array, memory: tuple) 
 
 
 def _integrated(own: Timestep, data: mjx.Data, memory: tuple, step: SubStep) -> mjx.Data:
-    """The state at the end of the timestep; memory: of the effects, as it was at its beginning."""
+    """Return the state at the end of the timestep; memory: of the effects, as it was at its beginning."""
     integrator = int(own.physics.mj_model.opt.integrator)
     if integrator == RK4:
         return _rk4(own, data, memory)
@@ -229,7 +229,7 @@ def _integrated(own: Timestep, data: mjx.Data, memory: tuple, step: SubStep) -> 
 
 
 def _in_turn(data: mjx.Data) -> mjx.Data:
-    """The same numbers, the inertia only once the acceleration is known: the integrators factor a second matrix.
+    """Return the same numbers, the inertia only once the acceleration is known: the integrators factor a second matrix.
 
     On a CPU two of LAPACK's batched factorisations at once can wait for each other for ever (linalg.py).
     """
@@ -239,14 +239,14 @@ def _in_turn(data: mjx.Data) -> mjx.Data:
 
 
 def _inside(own: Timestep, ctrl: jax.Array, slope: jax.Array) -> jax.Array:
-    """The slope, no steeper than stages inside ctrlrange allow: what MuJoCo clips there would be lost to the mean."""
+    """Return the slope, no steeper than stages inside ctrlrange allow: what MuJoCo clips there is lost to the mean."""
     low, high = ranges(own.model.actuator_ctrllimited, own.model.actuator_ctrlrange)
     up, down = jnp.maximum(high - ctrl, 0.0), jnp.minimum(low - ctrl, 0.0)
     return jnp.clip(slope, jnp.maximum(down, -4 * up), jnp.minimum(up, -4 * down))
 
 
 def _rk4(own: Timestep, first: mjx.Data, memory: tuple) -> mjx.Data:
-    """The classical Runge-Kutta method of fourth order, from its first stage.
+    """Return the classical Runge-Kutta method of fourth order, from its first stage.
 
     Actuators' forces are corrected in every stage, from the same memory: what effects remember is of the first one.
     Held over the timestep are the controller's output (but for the slope of commands), the effects' own forces (their

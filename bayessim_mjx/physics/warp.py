@@ -81,7 +81,7 @@ class Warp:
         return self._over(timesteps, ())(*args)
 
     def _over(self, timesteps: Callable[..., mjx.Data], shape: tuple[int, ...]) -> Callable[..., mjx.Data]:
-        """The same of worlds `[*shape]`, which `vmap` makes `[n, *shape]`."""
+        """Return the same of worlds `[*shape]`, which `vmap` makes `[n, *shape]`."""
         worlds = math.prod(shape)
         scratch = self._data(self.room(worlds))
 
@@ -109,7 +109,7 @@ class Warp:
         return counted
 
     def _apart(self, data: mjx.Data) -> mjx.Data:
-        """`data` without contacts, so that it is of one kind whatever room there was."""
+        """Return `data` without contacts, so that it is of one kind whatever room there was."""
         bare, structure = jax.tree.flatten(self._bare)
         pairs = zip(jax.tree.leaves(data), bare, strict=True)
         return jax.tree.unflatten(structure, [x if jnp.shape(x) == none.shape else none for x, none in pairs])
@@ -119,7 +119,7 @@ class Warp:
         return jax.tree.map(lambda x, one: x.ndim > one.ndim, data, self._bare)
 
     def model_of(self, fields: Mapping[str, jax.Array]) -> mjx.Model:
-        """The model with these arrays of the JAX implementation's, by dotted name, in place of the nominal ones."""
+        """Return the model with these arrays of JAX's, by dotted name, in place of the nominal ones."""
         return self.model.tree_replace({name: x.reshape(self._shape(name)) for name, x in fields.items()})
 
     def _shape(self, name: str) -> tuple[int, ...]:
@@ -157,7 +157,7 @@ def refuse_overflow(share: Any, of: str) -> None:
 
 
 def without_warp(error: RuntimeError) -> Exception:
-    """What to raise where MJX could not make a model for Warp: how to get Warp where that is missing, else the same."""
+    """Return the error where MJX could not make a model for Warp: how to get Warp if it is missing, else the same."""
     if "warp-lang" not in str(error):
         return error
     return UserError(

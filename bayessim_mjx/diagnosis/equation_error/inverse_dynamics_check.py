@@ -144,7 +144,7 @@ def check(
 
 
 def _searched(sums: Sums, known: Sequence[Term], offered: Sequence[Term], stated: bool) -> tuple[Found, float]:
-    """What the search came to, and the unit of the efforts: free where none is stated, unless it comes out as 1."""
+    """Describe the search's result and the unit of the efforts: free where none is stated, unless it is 1."""
     measured = np.array(sums.source) == "effort"
     if stated or not measured.any():
         return search(sums, known, offered), 1.0
@@ -223,7 +223,7 @@ class Proposals:
 def checked(
     logs: Sequence[Log], robot: Robot, dt: float, notes: list[str], say: Callable[[Look], None]
 ) -> tuple[gate.Gate, Look]:
-    """The gate, after the look, which takes less time and is said at once; again where the gate refuses more logs."""
+    """Run the gate after the look, which is faster and said at once; again where the gate refuses more logs."""
     sound = [log for log in logs if not gate.unusable(log, dt)]
     seen = looked(sound, robot, notes)
     say(seen)
@@ -235,7 +235,7 @@ def checked(
 
 
 def looked(logs: Sequence[Log], robot: Robot, notes: list[str]) -> Look:
-    """The look before any simulation; a failure costs the race its leads, not the diagnosis, and is `told`."""
+    """Look before any simulation; a failure costs the race its leads, not the diagnosis, and is `told`."""
     lost = sorted({name for log in logs for name in log.lost})
     if lost:
         need = f"they need the motion of all joints, and {', '.join(lost)} was not measured"

@@ -156,7 +156,7 @@ def _drives(own: _Search) -> list[Term]:
 
 
 def _moves(terms: Sequence[Term], own: Sequence[Term]) -> list[Move]:
-    """What may be added to the terms chosen."""
+    """List terms that may be added to those chosen."""
     left = [t for t in terms if _apart(t, own)]
     each = {t.effect: tuple(o for o in left if o.effect == t.effect and o.where != "all") for t in left}
     return [*((t,) for t in left), *(m for e, m in each.items() if len(m) > 1 and e not in ALONE)]
@@ -169,7 +169,7 @@ def _apart(term: Term, chosen: Sequence[Term]) -> bool:
 
 
 def _deviations(term: Term, values: Array, covariance: Array) -> dict[str, float]:
-    """Standard deviations of what is read from coefficients, by finite differences."""
+    """Return standard deviations of what is read from coefficients, by finite differences."""
     mean = term.read(values)
     steps = 1e-4 * np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     slopes = {k: np.zeros(len(values)) for k in mean}

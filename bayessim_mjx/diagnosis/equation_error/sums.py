@@ -42,7 +42,7 @@ class Layout:
         return self.at("end")
 
     def at(self, kind: str) -> int:
-        """The (first) column of one of OWN, or of zero, tilt, late, known (what the model says) and effort."""
+        """Return the (first) column of one of OWN, or of zero, tilt, late, known (what the model says) and effort."""
         return self._starts[kind]
 
     def body(self, i: int) -> slice:
@@ -103,7 +103,7 @@ def _known(model: mujoco.MjModel, i: int) -> bool:
 
 
 def layout_of(model: mujoco.MjModel) -> Layout:
-    """The columns of a model."""
+    """Return the columns of a model."""
     dofs = [drives.dof_of(model, i) for i in range(model.nu)]
     shared = tuple(i for i, dof in enumerate(dofs) if dof is not None and dofs.count(dof) > 1)
     return Layout(len(rigid_body.moving_bodies(model)), model.nv, shared)
@@ -152,7 +152,7 @@ def _zeros(model: mujoco.MjModel, moved: Motion) -> dict[int, Array]:
 
 
 def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
-    """The sums of logs that move; joints whose effort is not known in all of them are left out."""
+    """Return the sums of logs that move; joints whose effort is not known in all of them are left out."""
     each = [sources(log, model) for log in logs]
     source = tuple(_common(s) for s in zip(*each, strict=True))
     layout = layout_of(model)
@@ -169,14 +169,14 @@ def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
 
 
 def _common(each: Sequence[str]) -> str:
-    """The source that all logs have."""
+    """Return the source that all logs have."""
     if len(set(each)) == 1:
         return each[0]
     return "ctrl" if set(each) == {"ctrl", "effort"} else ""
 
 
 def shortened(logs: Sequence[Log]) -> list[Log]:
-    """The middle parts of logs that are too long together."""
+    """Keep the middle parts of logs that are too long together."""
     share = ROWS / max(sum(len(log) for log in logs), 1)
     if share >= 1:
         return list(logs)

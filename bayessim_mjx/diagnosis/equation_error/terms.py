@@ -103,7 +103,7 @@ def _on_actuators(model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[
 
 
 def scale(effect: str, where: str, on: NDArray[np.bool_], sd: float = np.inf, rest: Array | None = None) -> Term:
-    """The effort that was logged times `gain` is what acts, so the logged one is the needed one over `gain`.
+    """Scale the effort that was logged by `gain`, so the logged one is the needed one over `gain`.
 
     Args:
         sd: of 1 / gain about 1, as far as that is known beforehand.
@@ -115,12 +115,12 @@ def scale(effect: str, where: str, on: NDArray[np.bool_], sd: float = np.inf, re
 
 
 def _askew(effect: str) -> float:
-    """Standard deviation of an angle [rad] whose usual range is two of them either way."""
+    """Return standard deviation of an angle [rad] whose usual range is two of them either way."""
     return library.load(effect).quantities[0].high / 2
 
 
 def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term]:
-    """A point mass on each body: its mass, and its mass times where it sits from the body's own centre of mass."""
+    """Return a point mass on each body: its mass, and that times its place from the body's own centre of mass."""
     out = []
     for body, base, centre, turn, _ in _placed(model):
         bare = model.body_weldid[body] != body and model.body_mass[body] <= 0
@@ -137,7 +137,7 @@ def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term
 
 
 def links(model: mujoco.MjModel, layout: Layout) -> list[Term]:
-    """The centre of mass of each body, and the inertia about it, as accurate as data sheets are (effects)."""
+    """Return the centre of mass of each body, and the inertia about it, as accurate as data sheets are (effects)."""
     out, none = [], np.zeros((3, 3))
     *places, inertia = library.load("inertial_parameters").quantities
     for body, base, centre, turn, axes in _placed(model):
@@ -176,7 +176,7 @@ def _link(c: Array) -> Mapping[str, float]:
 
 
 def _load(layout: Layout, body: int, centre: Array, turn: Array) -> Callable[[Array], Array]:
-    """Maps `[nv, P, 4]` of (mass m, mass times place s in the body's own axes), linear near the last round's place.
+    """Map (mass m, mass times place s in the body's own axes) to `[nv, P, 4]`, linear near the last round's place.
 
     Inertial parameters of a point mass grow with (m, s) as a whole, so they are their own first order (Euler).
     """
@@ -202,7 +202,7 @@ def _place(c: Array) -> Array:
 
 
 def _spread(most: float, reach: float) -> Callable[[Array], Array]:
-    """What the logs do not tell of a load's place stays near the body's own centre."""
+    """Keep a load's place near the body's own centre where the logs do not show it."""
 
     def sd(last: Array) -> Array:
         mass = last[0] if last[0] > 0 else most
@@ -249,7 +249,7 @@ def _term(
     high: float = np.inf,
     sd: float | Array = np.inf,
 ) -> Term:
-    """A term of one map `[nv, P]` or several `[nv, P, k]`, each with a coefficient."""
+    """Return a term of one map `[nv, P]` or several `[nv, P, k]`, each with a coefficient."""
     maps = maps.reshape(*maps.shape[:2], -1)
     k = maps.shape[-1]
     least, most, believed = (np.broadcast_to(x, k).astype(float) for x in (low, high, sd))

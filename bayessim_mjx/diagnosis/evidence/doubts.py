@@ -40,7 +40,7 @@ class Doubts:
     as_known: Array
 
     def beside(self, fit: Fit) -> Fit:
-        """The fit with these numbers behind its own, in units of their priors."""
+        """Return the fit with these numbers behind its own, in units of their priors."""
         own = np.asarray(self.columns + fit.A[:, :, : len(self.as_known)] @ self.as_known)
         names = [f"doubt{i}" for i in range(own.shape[2])]
         more = tuple(Coordinate(name, (), 0.0, -np.inf, np.inf, 1.0, "", stated=True) for name in names)
@@ -152,7 +152,7 @@ def common(fitter: Fitter, D: Array, size: Array) -> Array:
 
 
 def of_motion(fitter: Fitter, nodes: int) -> tuple[Array, Array]:
-    """Forces `[W, 4, nv, m]`: M a, by speed, by position (N m or N), by direction (its sign); then the states.
+    """Return forces `[W, 4, nv, m]`: M a, by speed, by position (N m or N), by direction (its sign); then the states.
 
     These are speeds and positions `[W, 2, nv, m]`, all at the nodes.
     """

@@ -80,13 +80,13 @@ class ForceLeft:
 
 
 def of_set(weighing: Weighing, key: Key) -> ForceLeft:
-    """The posterior of the force that a weighed set of effects leaves."""
+    """Return the posterior of the force that a weighed set of effects leaves."""
     found = weighing.scored[key]
     return force_left(weighing.windows(found.fit), belief_of(found.fit), found.learnt, weighing.scale)
 
 
 def force_left(windows: Windows, belief: Belief, learnt: Learnt, scale: Array) -> ForceLeft:
-    """The posterior of the force at a fit with its best hyperparameters.
+    """Return the posterior of the force at a fit with its best hyperparameters.
 
     Args:
         windows, belief: of the fit; learnt: their best hyperparameters; scale: `[nv]`, the robot's force scale.

@@ -63,7 +63,7 @@ class Windows:
 def windows_of(
     r: Array, A: Array, B: Array, D: Array, offsets: Array, spread: Array, scale: Array, channels: int
 ) -> Windows:
-    """The inner products of a fit.
+    """Return the inner products of a fit.
 
     Args:
         r, A, B: `[W, n]`, `[W, n, k]`, `[W, n, s]`, whitened, rows in the order of time, channels side by side.
@@ -103,7 +103,7 @@ def correlation(nodes: int, memory: float) -> Array:
 
 
 def marginal(windows: Windows, hyper: Hyper) -> Marginal:
-    """The windows under some hyperparameters (Woodbury's identity: the size is that of the force, not of the rows)."""
+    """Return the windows under some hyperparameters (Woodbury's identity: of the force's size, not the rows')."""
     own, forces = 1 + windows.parameters, windows.forces
     gram = np.tensordot(1 / hyper.noise**2, windows.gram, 1)
     size = gram.shape[1] - own
@@ -130,7 +130,7 @@ class Belief:
     high: Array
 
     def best(self, Q: Array) -> Array:
-        """The most probable step `[k]`; Q `[1 + k, 1 + k]`, summed over windows."""
+        """Return the most probable step `[k]`; Q `[1 + k, 1 + k]`, summed over windows."""
         if not len(self.mean):
             return self.mean
         S, g = Q[1:, 1:], Q[1:, 0]

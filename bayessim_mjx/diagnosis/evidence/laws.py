@@ -74,7 +74,7 @@ def same_lateness(one: Candidate, other: Candidate, model: mujoco.MjModel) -> bo
 
 
 def _joint(c: Candidate, model: mujoco.MjModel) -> str:
-    """The joint of a candidate; of an actuator the joint that it drives."""
+    """Return the joint of a candidate; of an actuator the joint that it drives."""
     if c.kind != "actuator" or c.where not in [model.actuator(i).name for i in range(model.nu)]:
         return c.where
     driven = model.actuator(c.where)
@@ -95,12 +95,12 @@ def special_cases(effect: Candidate) -> tuple[str, ...]:
 
 @functools.cache  # thousands of pairs are compared, and all installed packages are looked through for a name
 def _said(effect: str, attribute: str) -> Any:
-    """What an effect's class says of it."""
+    """Return the class of an effect."""
     return getattr(load(effect), attribute, ()) if effect in names() else ()
 
 
 def as_large(one: Candidate, other: Candidate, values: Array) -> tuple[Array, ...]:
-    """A law's numbers at the values of another's with the same units, in their order; neutral where there are none.
+    """Return a law's numbers at another's values of the same units, in their order; neutral where there are none.
 
     The last value serves further numbers of its unit. () if no unit is the same.
     """
@@ -125,7 +125,7 @@ class Start:
 
 
 def with_same_inertia(fitter: Fitter, model: Model, effect: Candidate, law: Candidate) -> Start | None:
-    """The law's numbers, and known parameters, at which the bodies have the inertia of a fitted model, or nearly so.
+    """Return the law's numbers, and known parameters, at which bodies have the inertia of a fitted model, or nearly so.
 
     Args:
         effect: of the model, in whose place the law stands.

@@ -68,7 +68,7 @@ class Posterior:
         return np.asarray(moments * scale[:, None] * scale)
 
     def quantiles(self, ends: Sequence[float] = ENDS) -> Array:
-        """`[ends, k]`, of each parameter."""
+        """Return `[ends, k]`, of each parameter."""
         sd = np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 1e-300))
         return mixture_quantiles(self.weight, self.mean, sd, ends)
 
@@ -133,7 +133,7 @@ class Integrated:
 
 
 def belief_of(fit: Fit) -> Belief:
-    """The prior of a fit's step, with the data sheet's accuracies as the fit believes them."""
+    """Return the prior of a fit's step, with the data sheet's accuracies as the fit believes them."""
     neutral = np.array([c.neutral for c in fit.coordinates])
     low = np.array([c.low for c in fit.coordinates]) - fit.values
     high = np.array([c.high for c in fit.coordinates]) - fit.values
@@ -141,7 +141,7 @@ def belief_of(fit: Fit) -> Belief:
 
 
 def integrated(fit: Fit, learnt: Learnt, effects: Sequence[Mapping[int, bool]] = ()) -> Integrated:
-    """The evidence of a fit with its best hyperparameters.
+    """Return the evidence of a fit with its best hyperparameters.
 
     effects: of each {index of its number: whether it is a shape}; numbers may be neutral (`_without`).
     """
@@ -174,7 +174,7 @@ def _sized(
     own: Mapping[int, bool],
     data: tuple[Array, Array],
 ) -> float:
-    """What the evidence gains where an effect may be small: its range and parts of it are as likely (`Priors.sizes`).
+    """Return the evidence's gain where an effect may be small: its range and its parts are as likely (`Priors.sizes`).
 
     A prior as wide as the range alone would hold a small payload for less likely than a small error of a data sheet
     that does the same.
@@ -205,7 +205,7 @@ def _without(
     layers: dict[int, float],
     own: Mapping[int, bool],
 ) -> float:
-    """What the evidence gains where each of an effect's numbers may be neutral, with probability 1/2.
+    """Return the gain in evidence where each of an effect's numbers may be neutral, with probability 1/2.
 
     Not all that are no shapes: that would be the model without the effect.
 

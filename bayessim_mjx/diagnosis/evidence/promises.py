@@ -48,7 +48,7 @@ class Promises:
         self.base = max(level.base for level in self.levels)
 
     def pairs(self, blocked: NDArray[np.bool_], count: int) -> list[Promise]:
-        """The best pairs of columns that may be together."""
+        """Return the best pairs of columns that may be together."""
         gain = np.max([level.base + level.pairs() for level in self.levels], 0) - self.base
         gain[blocked] = -np.inf
         gain[np.tril_indices(len(gain))] = -np.inf
@@ -61,7 +61,7 @@ class Promises:
         return level.g - 0.5 * np.diag(level.S)
 
     def of(self, own: tuple[int, ...]) -> Promise:
-        """A set at the level at which its evidence is greatest."""
+        """Return a set at the level at which its evidence is greatest."""
         total, best = max(((level.base + (p := level.of(own)).nats, p) for level in self.levels), key=lambda x: x[0])
         return replace(best, nats=total - self.base)
 
@@ -110,7 +110,7 @@ class _Level:
 
 
 def _level(weighing: Weighing, fit: Fit, own: NDArray[np.int64], hyper: Hyper, columns: Sequence[Column]) -> _Level:
-    """The products in some windows `own`, as if those were typical of all."""
+    """Return the products in some windows `own`, as if those were typical of all."""
     belief, k = belief_of(fit), 1 + len(fit.values)
     Q, logdet = weighing.products(fit, hyper, np.stack([c.change for c in columns], 2), own)
     share = len(fit.r) / len(own)
@@ -129,7 +129,7 @@ def _level(weighing: Weighing, fit: Fit, own: NDArray[np.int64], hyper: Hyper, c
 def leading(
     weighing: Weighing, fit: Fit, own: NDArray[np.int64], hyper: Hyper, columns: Sequence[Column]
 ) -> list[Column]:
-    """The columns that promise most by themselves, so many of each candidate (`Effort.points`)."""
+    """Return the columns that promise most by themselves, so many of each candidate (`Effort.points`)."""
     hyper, count, nats = _scaled(hyper, PRIORS.sizes[1]), Counter[str](), list[float]()
     for first in range(0, len(columns), EFFORT.windows):  # some at a time: products of all are large
         nats += _level(weighing, fit, own, hyper, columns[first : first + EFFORT.windows]).singles().tolist()
@@ -162,7 +162,7 @@ class Plan:
 
 
 def around(weighing: Weighing, key: Key, say: Progress) -> list[Plan]:
-    """Sets that have more effects than a fitted model, most promising first.
+    """Return sets that have more effects than a fitted model, most promising first.
 
     On the known parameters by what was screened; on effects the most promising candidates are simulated there, as
     effects change what others do.

@@ -129,7 +129,7 @@ class Search:
         return self._plans[key][1]
 
     def _worth(self, plans: Sequence[Plan], sizes: Sequence[int], least: int = 0) -> list[Plan]:
-        """The best of the new ones, so many of each size: a larger set also mends what is not linear."""
+        """Return the best of the new ones, so many of each size: a larger set also mends what is not linear."""
         top = max(self.weighing.weighed().nats.values())
         out: dict[Key, Plan] = {}
         count = [0] * len(sizes)
@@ -160,7 +160,7 @@ class Search:
             self._fit([Plan(key, np.inf, parent) for key, parent in fewer.items()], "dropping", LEAVING_OUT)
 
     def _finish(self) -> None:
-        """The fits of the finalists brought to their end."""
+        """Bring the fits of the finalists to their end."""
         some = [k for k in self._order()[: EFFORT.sets[0]] if k and k not in self._polished]
         if some and not self.state.settings.budget.over(LEAVING_OUT):
             polish(self.state, [self.state.models[k] for k in some], self.say)
@@ -168,7 +168,7 @@ class Search:
             self.weighing.score(some)
 
     def _possible(self) -> None:
-        """The answer with one effect more that may do the work of a known parameter.
+        """Add to the answer one effect that may do the work of a known parameter.
 
         The logs do not need it, so it changes no name. It widens the interval of the parameter. A fit of before began
         at the parameter as it is, and may rest there.
@@ -186,7 +186,7 @@ class Search:
             self._fit(plans, "beside known parameters", TOGETHER)
 
     def _at_one_place(self) -> None:
-        """Special cases where the laws that contain them came to rest: with the rest neutral both are one model.
+        """Try special cases where the laws that contain them came to rest: with the rest neutral both are one model.
 
         Friction that sticks makes a cost of many small basins, whose evidence differs by up to six nats.
         """
@@ -198,7 +198,7 @@ class Search:
                     self._placed(model, law, c)
 
     def _placed(self, model: Model, law: Candidate, case: Candidate) -> None:
-        """A special case in the place of a model's law, as large as it is; kept where it is likelier than it was."""
+        """Try a special case in the place of a model's law, as large as it is; keep it where it is likelier."""
         state, starts = self.state, as_large(case, law, model.values_of(law))
         kept = tuple(e for e in model.effects if e is not law)
         if not starts:
@@ -207,7 +207,7 @@ class Search:
         self._likelier({frozenset(e.label for e in (*kept, case)): scored(state.fitter, fit, (*kept, case))})
 
     def _likelier(self, models: Mapping[Key, Model]) -> None:
-        """Takes models in the place of those of the same effects, where they are likelier."""
+        """Take models in the place of those of the same effects, where they are likelier."""
         before = {k: (self.state.models[k], self.weighing.scored[k]) for k in models if k in self.weighing.scored}
         self.state.models.update(models)
         self.weighing.score(list(models))

@@ -159,7 +159,7 @@ def select(
 
 
 def _rivals(weighing: Weighing, effect: Candidate, found: Weighed) -> list[Rival]:
-    """What may stand in an effect's place, most likely first: sets without strong evidence against them."""
+    """List sets that may stand in an effect's place, most likely first: sets without strong evidence against them."""
     others = [k for k in found.beside if k and not found.answer < k]
     return [_rival(weighing, effect, k, found) for k in others if effect.label not in k and k - found.answer]
 

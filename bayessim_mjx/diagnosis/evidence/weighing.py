@@ -60,7 +60,7 @@ class Weighed:
         return list(dict.fromkeys([self.answer, *(k for k, w in self.sets.items() if w * ODDS.strong >= best)]))
 
     def to_dicts(self) -> list[dict[str, Any]]:
-        """The sets with 99.9 % of the probability, and the known parameters alone, for JSON."""
+        """Return the sets with 99.9 % of the probability, and the known parameters alone, for JSON."""
         kept, whole = [], 0.0
         for key, weight in self.weight.items():
             kept += [key] if whole < 0.999 or key == BASE else []
@@ -74,7 +74,7 @@ class Weighed:
 
 
 def core(key: Key, excess: Mapping[Key, float]) -> Key:
-    """The smallest subset of a set that leaves no relevant part of the gap more than the set.
+    """Return the smallest subset of a set that leaves no relevant part of the gap more than the set.
 
     Args:
         excess: {set: held-out squared error above the noise, in noise variances}, of all sets that were fitted.
@@ -87,7 +87,7 @@ def core(key: Key, excess: Mapping[Key, float]) -> Key:
 def weighed(
     evidence: Mapping[Key, float], excess: Mapping[Key, float], numbers: Mapping[Key, int], candidates: int
 ) -> Weighed:
-    """The posterior; `evidence` and `excess` (see `core`) have the empty set, the known parameters alone."""
+    """Return the posterior; `evidence` and `excess` (see `core`) have the empty set, the known parameters alone."""
     total = {k: e + log_prior(k, candidates) for k, e in evidence.items()}
     own, of = {k: excess[k] for k in evidence}, dict[Key, list[float]]()
     for key, nats in total.items():
@@ -144,7 +144,7 @@ class Weighing:
         self.score([BASE])
 
     def windows(self, fit: Fit, own: NDArray[np.int64] | slice = slice(None)) -> Windows:
-        """The linear model about a fit to the windows `own`."""
+        """Return the linear model about a fit to the windows `own`."""
         spread = self.state.fitter.spread
         return windows_of(fit.r, fit.A, fit.B, self.D[own], fit.offsets, spread, self.scale, self.channels)
 
@@ -193,11 +193,11 @@ class Weighing:
         return self.scored[key].found.nats + more - self.scored[BASE].found.nats
 
     def weighed(self) -> Weighed:
-        """The posterior over what was weighed."""
+        """Return the posterior over what was weighed."""
         return self._weighed({k: s.found.nats for k, s in self.scored.items()})
 
     def without(self, condition: int) -> Weighed:
-        """The posterior given all windows but those of one operating condition, with the same hyperparameters."""
+        """Return the posterior given all windows but those of one operating condition, by the same hyperparameters."""
         kept = self.state.fitter.simulator.windows.group != condition
         return self._weighed({k: _without(s, kept) for k, s in self.scored.items()})
 
@@ -240,7 +240,7 @@ class Estimated:
 
 
 def at_its_mean(weighing: Weighing, key: Key) -> Model:
-    """The model at its posterior mean, held-out estimates refitted; where it was if that is no better place.
+    """Return the model at its posterior mean, held-out estimates refitted; where it was if that is no better place.
 
     A mean far from the fit is the step of a linear model: from there it is looked for again.
     """
@@ -301,7 +301,7 @@ def _taken(weighing: Weighing, of: Scored, columns: Array) -> Array:
 
 
 def _spread(share: Array, away: Array, sd: Array) -> Array:
-    """Standard deviations `[k]` about 0 of a mixture of Gaussians; 1.645 of them hold 90 % of it at least.
+    """Return standard deviations `[k]` about 0 of a mixture of Gaussians; 1.645 of them hold 90 % of it at least.
 
     With a fifth of its probability far off, 1.645 standard deviations of a mixture do not reach there.
 

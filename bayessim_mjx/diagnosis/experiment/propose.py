@@ -98,7 +98,7 @@ def stage(found: Findings, say: Progress) -> Findings:
 def propose(
     found: Findings, rivals_models: Sequence[Model] | None = None, limits: Mapping[str, Any] | None = None
 ) -> Experiment:
-    """The experiment that separates the surviving models best, within the limits.
+    """Return the experiment that separates the surviving models best, within the limits.
 
     Args:
         rivals_models: models to be told from the winner; None: its rivals, and without any the closest losers.
@@ -165,7 +165,7 @@ def _thetas(scorer: Scorer, shift: Array) -> Array:
 
 
 def _look(scorer: Scorer, stand: Rehearsal, every: Sequence[Excitation]) -> list[Scored]:
-    """A first look at the whole menu, on about as many windows as the logs have, best first."""
+    """Look first at the whole menu, on about as many windows as the logs have, best first."""
     shift = np.zeros(len(scorer.fitter.theta))
     played = [p for p in stand.play(every, _thetas(scorer, shift)) if p.safe] if every else []
     if not played:
@@ -181,7 +181,7 @@ def _scored(scorer: Scorer, played: Played, pairs: Array, help_: Help | None = N
 
 
 def _with_help(scorer: Scorer, stand: Rehearsal, scored: list[Scored], model: Any) -> list[Scored]:
-    """The best two motions again, with a known payload and with the robot mounted on its side."""
+    """Play the best two motions again, with a known payload and with the robot mounted on its side."""
     out = []
     top = [s.played.excitation for s in scored[:2]]
     for own in helps(scorer.setup) if top else []:
@@ -194,7 +194,7 @@ def _with_help(scorer: Scorer, stand: Rehearsal, scored: list[Scored], model: An
 
 
 def _in_full(scorer: Scorer, stand: Rehearsal, scored: list[Scored], attended: list[Scored]) -> list[Scored]:
-    """The best ones on all of their windows."""
+    """Play the best ones on all of their windows."""
     if not scored:
         return []
     best = [s.played for s in scored[: SIZE.final]]
@@ -231,7 +231,7 @@ def _decide(scorer: Scorer, stand: Rehearsal, final: list[Scored], looked: list[
 
 
 def _named(pairs: Array, labels: Sequence[str]) -> list[dict[str, Any]]:
-    """The mean of both directions of every pair."""
+    """Return the mean of both directions of every pair."""
     n = len(labels)
     return [
         {"a": labels[i], "b": labels[j], "evidence": float(pairs[i, j] + pairs[j, i]) / 2}
@@ -255,7 +255,7 @@ class Help:
 
 
 def helps(setup: Setup) -> list[Help]:
-    """A known payload on the last body, and two other mounts: where the effects that describe them are in the stack."""
+    """Offer a known payload on the last body, and two other mounts: where their effects are in the stack."""
     physics, out = setup.physics, []
     for effect in physics.effects:
         *_, last = physics.blocks_of(effect)
@@ -290,7 +290,7 @@ def missing_streams(models: Sequence[Model], logs: Sequence[Log]) -> list[str]:
 
 
 def instead(models: Sequence[Model]) -> str:
-    """What else would separate the models' effects."""
+    """Name what else would separate the models' effects."""
     return phrases.separating(c.effect for m in models for c in m.effects)
 
 

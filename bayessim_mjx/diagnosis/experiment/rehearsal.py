@@ -150,7 +150,7 @@ class Rehearsal:
         return out
 
     def _plan(self, e: Excitation, scale: float, gravity: Array | None) -> Plan:
-        """Reference and feed-forward; motions are rounded off so that the drives can follow them."""
+        """Return reference and feed-forward; motions are rounded off so that the drives can follow them."""
         d, dt, model = self.drives, self.windows.dt, self.setup.physics.mj_model
         offset = e.offset * scale
         for i, v in enumerate(d.v):
@@ -238,6 +238,6 @@ def _columns(physics: Physics, effects: set[str]) -> tuple[NDArray[np.int64], li
 
 
 def _rounded(x: Array, width: float, dt: float) -> Array:
-    """Moving average over `width` s, twice half of it, ends held: a jump of the speed becomes a ramp."""
+    """Return moving average over `width` s, twice half of it, ends held: a jump of the speed becomes a ramp."""
     rows = max(1, int(round(width / 2 / dt)))
     return np.asarray(uniform_filter1d(uniform_filter1d(x, rows, mode="nearest"), rows, mode="nearest"))

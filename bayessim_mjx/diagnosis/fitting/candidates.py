@@ -83,7 +83,7 @@ class Candidate:
 def base_coordinates(
     space: ParameterSpace, accuracy: Mapping[str, float] | None = None, assumed: Collection[str] = ()
 ) -> tuple[Coordinate, ...]:
-    """The parameters that the simulator already has, Gaussian where a data sheet states them, else nearly flat.
+    """Return the parameters that the simulator already has, Gaussian where a data sheet states them, else nearly flat.
 
     Args:
         accuracy: {name: standard deviation as a share of the nominal value}, of those that a data sheet states.
@@ -114,7 +114,7 @@ def _precision(p: Parameter, accuracy: float | None) -> float:
 
 
 def kinds_of(effects: str | Sequence[str | type[Effect]]) -> list[type[Effect]]:
-    """The effects that are tried, those that act behind the others (`last`) at the end.
+    """Return the effects that are tried, those that act behind the others (`last`) at the end.
 
     "all", alone or among others: those of the library that are on offer (`offered`).
 
@@ -193,12 +193,12 @@ def _candidate(effect: Effect, where: str, blocks: Sequence[Block]) -> Candidate
 
 
 def shrink(c: Coordinate) -> float:
-    """A half-normal of the range's width: keeps what data cannot tell near neutral, and is nothing to what they can."""
+    """Return a half-normal of the range's width: it keeps numbers near neutral that no data identify."""
     return 1.0 / (c.high - c.low) ** 2
 
 
 def _probes(effect: Effect, coordinates: Sequence[Coordinate]) -> Array:
-    """Starting points `[n, k]`: each amplitude alone at each grid value, shapes over their grids.
+    """Return starting points `[n, k]`: each amplitude alone at each grid value, shapes over their grids.
 
     Amplitudes that act together alone (`Effect.joint`) also in all combinations; shapes of a star (`Effect.star`) only
     one at a time.

@@ -63,7 +63,7 @@ class Shift:
         return min(self.late, 0.0) if self.certain else 0.0
 
     def notes(self, period: float) -> list[str]:
-        """What the user is told; period: s between rows of the log."""
+        """Return the note for the user; period: s between rows of the log."""
         return [self.sentence(period)] if self.certain else [self.hint()] if self.likely else []
 
     def hint(self) -> str:
@@ -72,7 +72,7 @@ class Shift:
         return f"{text}, beside a gap of another kind; if so, put `commands_late: {self.late:.4g}` beside the logs"
 
     def sentence(self, period: float) -> str:
-        """The finding; period: s between rows of the log."""
+        """Return the finding; period: s between rows of the log."""
         text = f"commands look shifted by {1e3 * self.late:+.2g} ms (+- {1e3 * self.error:.1g} ms)"
         if self.late > 0:
             why = "they act later than the log says, by time stamps or by what drives and sensors need"
@@ -85,7 +85,7 @@ class Shift:
 
 
 def estimate(errors: Errors, late: Shifted, sigma: Array, force: Array, factor: int) -> Shift | None:
-    """The shift of all commands together; None: the fit finds no end.
+    """Return the shift of all commands together; None: the fit finds no end.
 
     Args:
         errors: with its start states fitted.
@@ -139,7 +139,7 @@ class _Model:
         return np.stack([(first - moved) / STEP for moved in there], -1)
 
     def residual(self, x: Array, starts: Array) -> Array:
-        """starts: `[W, 2 nv]`, further changes of the start states."""
+        """Simulate; starts: `[W, 2 nv]`, further changes of the start states."""
         return np.asarray(self._residuals([x], starts)[0])
 
     def _residuals(self, several: Iterable[Array], starts: Array | None = None) -> Array:
@@ -189,7 +189,7 @@ def _judged(q: Quadratic, x: Array, precision: Array, cut: Windows, count: int) 
 
 
 def _apart(q: Quadratic, x: Array, precision: Array, cut: Windows) -> float:
-    """Standard deviation of the conditions' own shifts about that of all, as `Shift`, with the other columns free."""
+    """Return the sd of the conditions' own shifts about that of all, as `Shift`, with the other columns free."""
     names = np.unique(cut.group)
     own = (cut.group[:, None] == names).astype(float)  # [W, G]
     cross = np.einsum("wg,wj->gj", own, q.S[:, 0, 1:])

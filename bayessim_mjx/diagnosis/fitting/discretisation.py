@@ -73,7 +73,7 @@ class Discretisation:
     limit: Array | None = None
 
     def robot(self, robot: Robot) -> Robot:
-        """The robot at the sub-steps of the diagnosis."""
+        """Return the robot at the sub-steps of the diagnosis."""
         return robot if self.factor == 1 else refined(robot, self.timestep / self.factor)
 
     def noisier(self, cut: Windows) -> Windows:
@@ -156,7 +156,7 @@ class Discretisation:
 
 
 def refined(robot: Robot, timestep: float) -> Robot:
-    """The robot with another timestep in its model, s."""
+    """Return the robot with another timestep in its model, s."""
     model = copy.copy(robot.mj_model)
     model.opt.timestep = timestep
     return dataclasses.replace(robot, mj_model=model)
@@ -171,7 +171,7 @@ def measure(
     first: int = 1,
     limit: Array | None = None,
 ) -> Discretisation:
-    """The errors of `physics` (without effects) in the windows, and the sub-steps that the diagnosis should take.
+    """Return the errors of `physics` (without effects) in the windows, and the sub-steps for the diagnosis.
 
     Args:
         cuts: factor -> the same windows with commands for that many times the sub-steps.
@@ -219,19 +219,19 @@ def simulated(model: mujoco.MjModel, logs: Sequence[Log]) -> NDArray[np.bool_]:
 
 
 def _gain(one: Array, two: Array) -> float:
-    """What halving the sub-step gains in the usual window: from hardly anything (chaos) to the second order's 4."""
+    """Return the gain of halving the sub-step in the usual window: from hardly any (chaos) to the second order's 4."""
     size = [np.sqrt(np.sum(e**2, (1, 2))) for e in (one, two)]
     ratio = np.median(size[0] / np.maximum(size[1], 1e-12))
     return float(np.clip(ratio, 1.1, 4.0))
 
 
 def _all(gain: float, touching: bool) -> float:
-    """What all halvings change, in what the first one does: alike, or with contacts each in a way of its own."""
+    """Return the change by all halvings, in that of the first one: alike, or with contacts each in a way of its own."""
     return float(1 / np.sqrt(1 - gain**-2.0)) if touching else gain / (gain - 1)
 
 
 def _choose(error: dict[int, float]) -> int:
-    """The coarsest factor that is fine enough; where none is, the finest, if that gains anything."""
+    """Return the coarsest factor that is fine enough; where none is, the finest, if that gains anything."""
     coarsest, finest = min(error), max(error)
     enough = [f for f, e in error.items() if e < ENOUGH]
     return min(enough) if enough else finest if error[finest] < ENOUGH * error[coarsest] else coarsest

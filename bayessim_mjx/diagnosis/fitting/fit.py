@@ -68,7 +68,7 @@ class Fit:
         return np.clip(np.divide(RULES.change, size, where=size > 0, out=own.copy()), own / REACH, own * REACH)
 
     def inward(self, values: Array, steps: Array) -> Array:
-        """Steps down where ranges end above."""
+        """Turn steps down where ranges end above."""
         return np.where(values + steps <= [c.high for c in self.coordinates], steps, -steps)
 
     def trust(self) -> Array:

@@ -84,7 +84,7 @@ class Fitter:
     def begin(
         self, coordinates: Sequence[Coordinate], values: Array | None = None, offsets: Array | None = None
     ) -> Fit:
-        """A fit with fresh columns for everything."""
+        """Return a fit with fresh columns for everything."""
         coordinates = tuple(coordinates)
         values = np.array([c.neutral for c in coordinates]) if values is None else np.asarray(values, float)
         offsets = np.zeros((len(self.simulator.windows), len(self.spread))) if offsets is None else offsets
@@ -125,7 +125,7 @@ class Fitter:
         return np.sum(r**2, 1) + np.sum((offsets / self.spread) ** 2, 1)
 
     def derive(self, fit: Fit, extra: Sequence[Coordinate], values: Array) -> Fit:
-        """A fit with more coordinates, starting at `values` for these; its first columns come with the first step."""
+        """Return a fit with more coordinates, starting at `values`; its first columns come with the first step."""
         own = tuple(fit.coordinates) + tuple(extra)
         blank = np.zeros((*fit.r.shape, len(extra)))
         start, columns = np.concatenate([fit.values, values]), np.concatenate([fit.A, blank], 2)
@@ -188,7 +188,7 @@ class Fitter:
         asked: Mapping[int, Sequence[int]],
         alone: bool = False,
     ) -> dict[int, tuple[Array, Array]]:
-        """`_tried` in one call; alone: without the trial points themselves."""
+        """Return `_tried` in one call; alone: without the trial points themselves."""
         thetas, offsets, sizes, steps = [], [], [], {}
         for i, which in asked.items():
             values, x = trial[i]
@@ -210,7 +210,7 @@ class Fitter:
         return cost < fit.cost or not np.isfinite(fit.cost), cost
 
     def _stepped(self, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int], steps: Array) -> Fit:
-        """The fit at a trial point where that is better, else more damped where it was."""
+        """Return the fit at a trial point where that is better, else more damped where it was."""
         better, cost = self._better(fit, r[0], values, x)
         if better:
             A = fit.A.copy()
@@ -227,7 +227,7 @@ class Fitter:
         return replace(fit, damping=damping, reach=reach, history=(*fit.history, fit.cost))
 
     def _propose(self, fit: Fit) -> tuple[Fit, tuple[Array, Array]]:
-        """(the fit with its next step's promise, the point to be tried next: values and offsets)."""
+        """Return (the fit with its next step's promise, the point to be tried next: values and offsets)."""
         q, starts = fit.quadratic(self.spread)
         g, S = q.weighted(fit.weight)
         precision, pull, low, high = fit.prior()

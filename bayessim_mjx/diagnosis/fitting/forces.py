@@ -30,13 +30,13 @@ SIZES = Sizes()
 
 
 def default_nodes(fitter: Fitter) -> int:
-    """Number of nodes in a window: one per control step for small robots, fewer for many joints, but six."""
+    """Return number of nodes in a window: one per control step for small robots, fewer for many joints, but six."""
     steps, nv = fitter.simulator.windows.steps, fitter.simulator.nv
     return min(steps, max(6, SIZES.columns // nv))
 
 
 def node_basis(steps: int, nodes: int) -> Array:
-    """`[steps, nodes]`: linear between nodes at the centres of equal pieces of the window, constant beyond the ends."""
+    """Return `[steps, nodes]`: linear between nodes at the centres of equal pieces, constant beyond the ends."""
     at = (np.arange(nodes) + 0.5) * steps / nodes
     return np.stack([np.interp(np.arange(steps) + 0.5, at, row) for row in np.eye(nodes)], 1)
 

@@ -55,7 +55,7 @@ class Step:
     reached: bool
 
     def robot(self, robot: Robot) -> Robot:
-        """The robot with the integrator."""
+        """Return the robot with the integrator."""
         if not self.changed:
             return robot
         model = copy.copy(robot.mj_model)
@@ -78,7 +78,7 @@ class Step:
 
 
 def coarsest_stable(model: mujoco.MjModel, logs: Sequence[Log], precise: bool = False) -> Step:
-    """The coarsest stable step of a model, with its own integrator, or with implicitfast where that may be coarser.
+    """Return the coarsest stable step of a model, with its own integrator, or implicitfast where that may be coarser.
 
     Args:
         precise: RK4 goes before both.
@@ -113,12 +113,12 @@ class Choice:
         return [*self.stable.sentences(), *self.better, *self.worth.beyond()]
 
     def warnings(self) -> list[str]:
-        """What the model's own step costs, where it can be simulated at all."""
+        """Return the cost of the model's own step, where it can be simulated at all."""
         return self.worth.warnings() if self.stable.factor == 1 else []
 
 
 def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, left: float = np.inf) -> Choice:
-    """The coarsest stable step; by RK4 where nothing can touch, the logs have noise and there is time.
+    """Return the coarsest stable step; by RK4 where nothing can touch, the logs have noise and there is time.
 
     Logs of a simulation may have been made by the model's own integrator.
 
@@ -157,7 +157,7 @@ class _Case:
         return self.stepper.linearised(self.qpos, self.qvel, self.row, h)[2]
 
     def factor(self, h: float) -> int:
-        """The power of two by which h has to be divided for errors to grow by e in a window at most, or 2 FINEST."""
+        """Return the power of two to divide h by for errors to grow by e at most in a window, or 2 FINEST."""
         factor = 1
         while factor <= FINEST and not _radius(self.step(h / factor)) < np.exp(
             (self.grows + 1 / CUTTING.window) * h / factor
@@ -171,7 +171,7 @@ def _radius(G: Array) -> float:
 
 
 def _joint(model: mujoco.MjModel, cases: Sequence[_Case], h: float) -> str:
-    """The dof that moves most in the mode that grows fastest."""
+    """Return the dof that moves most in the mode that grows fastest."""
     worst = max((case.step(h) for case in cases), key=_radius)
     values, modes = np.linalg.eig(worst)
     mode = np.abs(modes[model.nv :, int(np.argmax(np.abs(values)))])

@@ -51,7 +51,7 @@ class Journal:
         atomic.write_text(path, own)
 
     def play(self, asked: str, fit: Callable[[], list[Fit]]) -> list[Fit]:
-        """What was asked for: as it is on disk, else as `fit` gives it, which is then on disk."""
+        """Return a result as it is on disk, else as `fit` gives it, which is then on disk."""
         path = self.folder / f"{self.count:05d}.npz"
         self.count += 1
         known = _read(path, asked)
@@ -70,7 +70,7 @@ class Journal:
 
 
 def remove(folder: Path) -> None:
-    """The journal in a folder, and the folder where nothing else is in it."""
+    """Return the journal in a folder, and the folder where nothing else is in it."""
     if not (folder / ABOUT).is_file():
         return
     for path in (*folder.glob(FILES), *folder.glob("*.tmp"), folder / ABOUT):
@@ -151,7 +151,7 @@ def _write(path: Path, asked: str, fits: Sequence[Fit]) -> None:
 
 
 def _read(path: Path, asked: str) -> list[Fit] | None:
-    """The fits of a file that was written for this; None where there is none, or a damaged one."""
+    """Return the fits of a file that was written for this; None where there is none, or a damaged one."""
     try:
         with np.load(path, allow_pickle=False) as file:
             about = json.loads(str(file["about"]))

@@ -38,7 +38,7 @@ SIZES = (
 
 
 def shortened(logs: Sequence[Log], seconds: float) -> tuple[tuple[Log, ...], list[str]]:
-    """Logs that lack a joint's motion, cut to the beginnings that hold so many seconds together; and what that leaves.
+    """Cut logs that lack a joint's motion to the beginnings that hold so many seconds together, and say so.
 
     To find that motion takes milliseconds a row, and it is tracked from a log's first row on: where a joint is amid a
     log nothing tells. So of long logs their beginnings are filtered, each of its share.
@@ -58,7 +58,7 @@ def shortened(logs: Sequence[Log], seconds: float) -> tuple[tuple[Log, ...], lis
 
 
 def completed(logs: Sequence[Log], model: mujoco.MjModel) -> tuple[Log, ...]:
-    """The logs with the motion of joints that were not measured, and its standard deviations; others as they are.
+    """Complete the logs with the motion of joints that were not measured, and its standard deviations.
 
     Args:
         model: as it was delivered.
@@ -101,7 +101,7 @@ def _with(log: Log, way: Way, model: mujoco.MjModel) -> Log:
 
 
 def _smoothed(log: Log, model: mujoco.MjModel) -> Way:
-    """The best of some sizes of what the model lacks."""
+    """Return the best of some sizes of what the model lacks."""
     stepper = Stepper(model, log)
     measured = _Measured.of(log)
     lacking = _accelerations(model, log)
@@ -204,7 +204,7 @@ class _Filter:
 
 
 def _prior(nv: int) -> Array:
-    """Standard deviations `[2 nv]` of a log's first state: a radian or metre, and as much in a window."""
+    """Return standard deviations `[2 nv]` of a log's first state: a radian or metre, and as much in a window."""
     return np.repeat([1.0, 1 / CUTTING.window], nv)
 
 
@@ -286,7 +286,7 @@ class Stepper:
         mujoco.mj_resetData(self.model, self.data)
 
     def advanced(self, qpos: Array, qvel: Array, row: int, span: float | None = None) -> tuple[Array, Array]:
-        """The state at the next row, or `span` s later."""
+        """Return the state at the next row, or `span` s later."""
         span = float(self.log.time[row + 1] - self.log.time[row]) if span is None else span
         steps = max(1, int(np.ceil(span / self.longest - 1e-6)))
         self.model.opt.timestep = span / steps
@@ -298,7 +298,7 @@ class Stepper:
         return self.data.qpos.copy(), self.data.qvel.copy()
 
     def _at(self, qpos: Array, qvel: Array, row: int) -> Array:
-        """The command of a row; data in that state."""
+        """Return the command of a row; data in that state."""
         data, command = self.data, self.log.ctrl[row]
         if self.log.linear:
             command = 0.5 * (command + self.log.ctrl[row + 1])
@@ -322,7 +322,7 @@ class Stepper:
         return np.block([[J, none], [none, J]]), np.concatenate([off, J @ qvel]), sd
 
     def _equality(self, qpos: Array) -> tuple[Array, Array]:
-        """(derivatives `[m, nv]` of the active equality constraints by the position, their values `[m]`)."""
+        """Return (derivatives `[m, nv]` of the active equality constraints by the position, their values `[m]`)."""
         if not self.model.neq:
             return np.zeros((0, self.nv)), np.zeros(0)
         data = self.checked
@@ -337,7 +337,7 @@ class Stepper:
         return J[own].copy(), data.efc_pos[own].copy()
 
     def closed(self, qpos: Array, fixed: NDArray[np.bool_]) -> Array:
-        """A position with its equality constraints met by the joints that are not `fixed` `[nv]`."""
+        """Return a position with its equality constraints met by the joints that are not `fixed` `[nv]`."""
         if not self.model.neq or fixed.all():
             return np.array(qpos, float)
 
@@ -364,7 +364,7 @@ class Stepper:
         return *ends, way
 
     def accelerations(self, qpos: Array, qvel: Array, row: int) -> Array:
-        """Derivatives of the accelerations by the state `[nv, 2 nv]`."""
+        """Return derivatives of the accelerations by the state `[nv, 2 nv]`."""
 
         def at(nudge: Array) -> Array:
             self._at(*self.moved(qpos, qvel, nudge), row)
@@ -380,7 +380,7 @@ class Stepper:
         return there, qvel + change[self.nv :]
 
     def difference(self, qpos: Array, qvel: Array, to_qpos: Array, to_qvel: Array) -> Array:
-        """The change `[2 nv]` from one state to another."""
+        """Return the change `[2 nv]` from one state to another."""
         out = np.empty(2 * self.nv)
         mujoco.mj_differentiatePos(self.model, out[: self.nv], 1.0, qpos, to_qpos)
         out[self.nv :] = to_qvel - qvel

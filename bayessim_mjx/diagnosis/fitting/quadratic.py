@@ -51,7 +51,7 @@ class Quadratic:
     S: Array
 
     def subset(self, columns: NDArray[np.int64]) -> Quadratic:
-        """Some of the parameters."""
+        """Return some of the parameters."""
         return Quadratic(self.c, self.g[:, columns], self.S[:, columns[:, None], columns[None, :]])
 
     def at(self, p: Array) -> Array:
@@ -226,7 +226,7 @@ class Rest:
         return solve(S, g + self.pull, self.low, self.high)
 
     def by_parts(self, own: NDArray[np.int64], blocks: Mapping[int, Quadratic], costs: Array) -> Array:
-        """The mean of the steps without each part of the windows `own` and of the split ones; fills in their costs."""
+        """Average the steps without each part of the windows `own` and the split ones; fill in their costs."""
         windows, steps = np.arange(len(self.weight)), []
         for k in range(RULES.parts if blocks else min(RULES.parts, len(own))):
             part = np.isin(windows, own[k :: RULES.parts])
@@ -253,7 +253,7 @@ def weights(r: Array) -> Array:
 
 
 def columns(r: Array, shifted: Array, steps: Array) -> Array:
-    """A `[W, n, k]`: minus the derivative of the residual."""
+    """Return A `[W, n, k]`: minus the derivative of the residual."""
     if not len(steps):
         return np.zeros((*r.shape, 0))
     return np.ascontiguousarray(np.moveaxis((r[None] - shifted) / np.asarray(steps)[:, None, None], 0, -1))

@@ -75,14 +75,14 @@ class Robot:
         return dataclasses.replace(own, rating={**self.rating, **rated})
 
     def _from_data_sheet(self, own: bool) -> "Robot":
-        """A model's own numbers are taken for a data sheet's; ranges of a file say themselves what is known."""
+        """Take a model's own numbers for a data sheet's; ranges of a file say themselves what is known."""
         accuracy = data_sheet.accuracies((), self.space, data_sheet.ACCURACY) if own else {}
         return dataclasses.replace(self, accuracy=accuracy, assumed=frozenset(accuracy))
 
     def physics(
         self, control_dt: float, effects: Sequence[Effect] = (), space: ParameterSpace | None = None
     ) -> Physics:
-        """The robot at control steps of `control_dt` s, with `space` in the place of its own parameters."""
+        """Return the robot at control steps of `control_dt` s, with `space` in the place of its own parameters."""
         model = with_timestep(self.mj_model, control_dt)
         model.jnt_limited[list(self.unlimited)] = 0
         if self.rounds is not None:
@@ -92,7 +92,7 @@ class Robot:
 
 
 def pruned(robot: Robot, logs: Sequence[Log], dt: float) -> Robot:
-    """The robot as it is simulated beside these logs at control steps of `dt` s: without what they never reach."""
+    """Return the robot as simulated beside these logs at control steps of `dt` s: without what they never reach."""
     robot = dataclasses.replace(robot, unlimited=unreached(robot.mj_model, logs))
     alone = not robot.mj_model.neq and not contacts(robot.physics(dt))
     return dataclasses.replace(robot, rounds=ROUNDS) if alone else robot
@@ -102,7 +102,7 @@ Source: TypeAlias = str | Path | mujoco.MjSpec | mujoco.MjModel | Robot
 
 
 def robot_of(source: Source, parameters: str | Path | None = None) -> Robot:
-    """The robot of an MJCF file, a MuJoCo specification or a compiled model; a robot as it is.
+    """Return the robot of an MJCF file, a MuJoCo specification or a compiled model; a robot as it is.
 
     Args:
         parameters: a params.yaml; None: the default space, or the robot's own.
@@ -125,7 +125,7 @@ def robot_of(source: Source, parameters: str | Path | None = None) -> Robot:
 
 
 def of_task(env: "Task", parameters: str | Path | None = None) -> Robot:
-    """The robot of one of our own tasks (`registry.make`); parameters: a params.yaml, None: the default space.
+    """Return the robot of one of our own tasks (`registry.make`); parameters: a params.yaml, None: the default space.
 
     Raises:
         UserError: the task is not MuJoCo's, or the file is wrong.
@@ -141,7 +141,7 @@ def of_task(env: "Task", parameters: str | Path | None = None) -> Robot:
 def of_file(
     path: str | Path, parameters: str | Path | None = None, drive: str | None = None, packages: Sequence[str] = ()
 ) -> Robot:
-    """The robot of an MJCF (or URDF) file with hinge or slide joints and actuators.
+    """Return the robot of an MJCF (or URDF) file with hinge or slide joints and actuators.
 
     Args:
         drive: of a file without actuators, see `urdf.drive`; packages: see `urdf.read`.
@@ -177,7 +177,7 @@ def _by_mujoco(does: str, source: str, call: Callable[[], Any]) -> Any:
 
 
 def with_timestep(model: mujoco.MjModel, control_dt: float) -> mujoco.MjModel:
-    """A copy whose timestep is the largest that divides `control_dt` s and is no longer than the model's own."""
+    """Return a copy whose timestep is the largest that divides `control_dt` s and is no longer than the model's own."""
     if not control_dt > 0:
         raise ValueError(f"control_dt = {control_dt} s: must be positive")
     substeps = max(1, math.ceil(control_dt / model.opt.timestep - 1e-6))
@@ -218,12 +218,12 @@ def _scale(include: Sequence[str], within: tuple[float, float]) -> dict[str, Any
 
 
 def _literal(name: str) -> str:
-    """The name as a pattern that matches nothing else."""
+    """Return the name as a pattern that matches nothing else."""
     return "".join(f"[{c}]" if c in "*?[" else c for c in name)
 
 
 def _whole(model: mujoco.MjModel) -> str:
-    """A name of the whole model as an actor: none of its bodies is called so."""
+    """Return a name of the whole model as an actor: none of its bodies is called so."""
     name = elements.WHOLE
     while name in {model.body(b).name for b in range(model.nbody)}:
         name += "_"
@@ -238,7 +238,7 @@ def _of_training(raw: Any) -> list[str]:
 
 
 def read_params(path: str | Path, model: mujoco.MjModel) -> ParameterSpace:
-    """The space of a params.yaml in the loop's format.
+    """Return the space of a params.yaml in the loop's format.
 
     The file holds `task: {randomization_params: ...}`, as a task's YAML does, or that section's contents directly
     (`actor_params: ...`, `option: ...`). Other sections of a task's YAML are passed over.

@@ -154,7 +154,7 @@ def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
 
 
 def ranges(effect: type[Effect], place: str, scales: Scales) -> tuple[Parameter, ...]:
-    """The effect's parameters at a place, with ranges that fit this robot.
+    """Return the effect's parameters at a place, with ranges that fit this robot.
 
     Raises:
         UserError: a quantity grows with something that its kind of place does not have.

@@ -60,7 +60,7 @@ def _not_finite(model: mujoco.MjModel) -> list[str]:
 
 
 def _remedy(message: str) -> str:
-    """What to change in the MJCF."""
+    """Say what to change in the MJCF."""
     return next((f" ({remedy})" for word, remedy in _REMEDIES.items() if word in message), "")
 
 

@@ -51,7 +51,7 @@ class Centred(Effect):
 
 
 def physics_of(robot: Robot, dt: float, effects: Sequence[Effect]) -> Physics:
-    """The robot with these effects, for windows cut with `centred=False`."""
+    """Return the robot with these effects, for windows cut with `centred=False`."""
     return robot.physics(dt, (*effects, Centred()))
 
 
@@ -161,7 +161,7 @@ class Simulator:
         return own, past, past.first
 
     def _moved(self, motion: Motion, offset: jax.Array) -> Motion:
-        """The recorded motion with another state at its start, and moved as that is around it.
+        """Return the recorded motion with another state at its start, and moved as that is around it.
 
         What sensors remember begins there too: with the recorded start, rows that late sensors show of it would keep
         its noise, which no change of the start state takes away.
@@ -273,20 +273,20 @@ class Simulator:
         return np.concatenate(done).astype(np.float64)
 
     def _part(self, chains: Windows, which: NDArray[np.int64]) -> tuple[Batch, NDArray[np.int64]]:
-        """Some windows in a batch of the shape of one's own, and where in it each of `which` stands."""
+        """Return some windows in a batch of the shape of one's own, and where in it each of `which` stands."""
         unique, index = np.unique(which, return_inverse=True)
         rows = np.resize(unique, len(self.windows))
         return jax.tree.map(lambda x: np.asarray(x)[rows], chains.batch), index
 
 
 def _packed(world: World) -> jax.Array:
-    """The bits of a world's state and of what its effects remember, `[D]`: a call takes time for each array."""
+    """Return the bits of a world's state and of what its effects remember, `[D]`: a call takes time for each array."""
     leaves = jax.tree.leaves(world.replace(theta=(), fields={}))
     return jnp.concatenate([_cast(jnp.asarray(x), jnp.dtype("int32")).ravel() for x in leaves])
 
 
 def _unpacked(packed: jax.Array, like: World) -> World:
-    """The world that `_packed` was made of, with the theta and the model of another."""
+    """Return the world that `_packed` was made of, with the theta and the model of another."""
     leaves, tree = jax.tree.flatten(like.replace(theta=(), fields={}))
     parts = jnp.split(packed, np.cumsum([x.size for x in leaves])[:-1])
     each = [_cast(part.reshape(x.shape), x.dtype) for part, x in zip(parts, leaves, strict=True)]
@@ -294,6 +294,6 @@ def _unpacked(packed: jax.Array, like: World) -> World:
 
 
 def _cast(x: jax.Array, to: Any) -> jax.Array:
-    """The same bits, where both have 32."""
+    """Return the same bits, where both have 32."""
     same = x.dtype.itemsize == to.itemsize
     return jax.lax.bitcast_convert_type(x, to) if same else x.astype(to)

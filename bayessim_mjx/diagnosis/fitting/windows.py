@@ -158,7 +158,7 @@ def _batch(
     model: mujoco.MjModel,
     law: controllers.Law | None,
 ) -> Batch:
-    """The windows of `length` rows at `starts`, for the simulator."""
+    """Return the windows of `length` rows at `starts`, for the simulator."""
     around = _past(dt)
     pick = np.asarray([r for r, _ in starts])
     return Batch(
@@ -219,7 +219,7 @@ def _fine_commands(raw: Log, even: Log, dt: float, substeps: int, centred: bool)
 
 
 def _around(even: Sequence[Log], fine: list, starts: list[tuple[int, int]], around: int) -> Motion:
-    """Recorded rows `a - around .. a + around`; beyond the ends of a log the end is held."""
+    """Return recorded rows `a - around .. a + around`; beyond the ends of a log the end is held."""
     rows = [(r, rows_around(even[r], a, around)) for r, a in starts]
     files = [log.metadata.get("source", log.name) for log in even]  # pieces of one file share its clock
     begun = [min(o.time[0] for o, of in zip(even, files, strict=True) if of == file) for file in files]
@@ -284,7 +284,7 @@ def _labels(logs: Sequence[Log], key: str | None) -> list[str]:
 
 
 def group_notes(logs: Sequence[Log], key: str | None) -> tuple[str, ...]:
-    """What is held out in place of the conditions that were asked for, where these cannot be."""
+    """Say what is held out in place of the conditions that were asked for, where these cannot be."""
     labels = _labels(logs, key)
     if not key or not any(labels):
         return ()

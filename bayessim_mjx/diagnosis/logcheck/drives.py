@@ -32,7 +32,7 @@ def is_effort(mj_model: mujoco.MjModel, actuator: int) -> bool:
 
 
 def dof_of(mj_model: mujoco.MjModel, actuator: int) -> int | None:
-    """The degree of freedom of the hinge or slide joint that an actuator drives; None for tendons, sites, balls."""
+    """Return the degree of freedom of the hinge or slide joint of an actuator; None for tendons, sites, balls."""
     if mj_model.actuator_trntype[actuator] not in _JOINT:
         return None
     joint = mj_model.actuator_trnid[actuator, 0]
@@ -130,7 +130,7 @@ class Effort:
 
 
 def efforts(log: Log, model: mujoco.MjModel) -> Iterator[Effort]:
-    """The efforts of every joint whose drives are all known: from the `effort:` streams, and from ctrl."""
+    """Return the efforts of every joint whose drives are all known: from the `effort:` streams, and from ctrl."""
     dofs = [dof_of(model, i) for i in range(model.nu)]
     shown = on_dofs(measured_forces(log, model), model)
     asked = None if looped(log) else on_dofs(commanded(log, model), model)

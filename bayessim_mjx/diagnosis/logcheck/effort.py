@@ -70,7 +70,7 @@ def relations(log: Log, mj_model: mujoco.MjModel) -> list[Relation]:
 
 
 def remarks(related: Sequence[Relation]) -> list[Finding]:
-    """A log is refused where at least half of its joints have no effort that fits their motion."""
+    """Refuse a log where at least half of its joints have no effort that fits their motion."""
     best: dict[str, Relation] = {}
     for r in related:
         if r.explained is not None and (r.joint not in best or r.explained > (best[r.joint].explained or 0.0)):
@@ -150,7 +150,7 @@ class _Picture:
         return cls(Regressor.of(model, motion(log, model, cutoff), sets=np.array(sets)), len(moving), np.array(most))
 
     def bounded(self, dof: int, laden: bool) -> Bounded:
-        """The linear model of the effort at one degree of freedom.
+        """Return the linear model of the effort at one degree of freedom.
 
         Inertias within FACTOR, springs and friction only with the sign of springs and friction, gravity tilted as far
         as the effect of that name, any offset, and with `laden` loads.

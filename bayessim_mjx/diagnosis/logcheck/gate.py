@@ -40,7 +40,7 @@ class Report:
         return not self.of("refused")
 
     def of(self, kind: str) -> tuple[str, ...]:
-        """The texts of one kind: refused, warning or finding."""
+        """Return the texts of one kind: refused, warning or finding."""
         return tuple(r.text for r in self.remarks if r.kind == kind)
 
 
@@ -84,7 +84,7 @@ class Gate:
         return (alone or bool(self.qvel)) and all(self.qvel.values()) and all(log.has_qvel for log in self.usable)
 
     def demand(self) -> tuple[Log, ...]:
-        """The usable logs.
+        """Return the usable logs.
 
         Raises:
             UserError: there is none; with every reason.

@@ -56,7 +56,7 @@ def links(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> list[Link]:
 
 
 def _link(name: str, where: str, found: tuple[float, float, float], step: float, scaled: bool) -> Link:
-    """The verdict: sound where slope, shape and time agree within 5 %, 1 % and a sample."""
+    """Return the verdict: sound where slope, shape and time agree within 5 %, 1 % and a sample."""
     (slope, correlation, lag), faults = found, []
     if correlation < 0.99:
         faults.append(f"the shape differs (correlation {correlation:.3f})")
@@ -133,7 +133,7 @@ class Channel:
 def channels_of(
     logs: Sequence[Log], model: mujoco.MjModel, unit: bool, ask: Callable[[Log, mujoco.MjModel], Array] = commanded
 ) -> tuple[Channel, ...]:
-    """The drives whose effort was measured in all logs.
+    """Return the drives whose effort was measured in all logs.
 
     Args:
         unit: efforts have the unit of what is asked for; ask: what commands ask for, `[T, nu]`; default: the forces of
@@ -262,7 +262,7 @@ def _controllers(log: Log, mj_model: mujoco.MjModel) -> Iterator[Link]:
 
 
 def _drives(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link]:
-    """The measured effort, or the command where it is one, against the nominal inverse dynamics of the motion."""
+    """Return the measured effort, or the command where it is one, against the motion's nominal inverse dynamics."""
     found = {e.joint: e for e in reversed(list(efforts(log, mj_model)))}  # a stream comes before the command
     if not found:
         yield _untested("effort -> motion", "all joints", "no effort was logged, and the commands are targets")

@@ -46,7 +46,7 @@ def noise_known(log: Log, stream: str = "qpos") -> NDArray[np.bool_]:
 
 
 def repeats(logs: Sequence[Log]) -> list[list[Log]]:
-    """Groups of two or more runs of the same commands: declared by `repeat_of`, or found by equal command arrays.
+    """Group two or more runs of the same commands: declared by `repeat_of`, or found by equal command arrays.
 
     Raises:
         UserError: logs of different robots.
@@ -67,7 +67,7 @@ def repeats(logs: Sequence[Log]) -> list[list[Log]]:
 
 
 def _same(a: Log, b: Log) -> bool:
-    """The same commands at the same times from nearly the same state."""
+    """Return the same commands at the same times from nearly the same state."""
     rows = min(len(a), len(b))
     if rows < 0.8 * max(len(a), len(b)) or not a.channels.actuators:
         return False
@@ -99,7 +99,7 @@ def _smooth(x: Array) -> float | None:
 
 
 def _level(x: Array, order: int, rows: NDArray[np.bool_]) -> float:
-    """Standard deviation of white noise in x [T] by differences of an order: Var = binomial(2 n, n) sigma^2."""
+    """Return standard deviation of white noise in x [T] by differences of an order: Var = binomial(2 n, n) sigma^2."""
     return float(np.median(np.abs(np.diff(x, order)[: len(rows)][rows])) / np.sqrt(comb(2 * order, order)))
 
 

@@ -64,7 +64,7 @@ class Motion:
 
 
 def motion(log: Log, mj_model: mujoco.MjModel, cutoff: float | None = None) -> Motion:
-    """The smoothed motion of a log, at 20 times the cutoff or at the log's own rate, whichever is slower."""
+    """Return the smoothed motion of a log, at 20 times the cutoff or at the log's own rate, whichever is slower."""
     cutoff = bandwidth(log) if cutoff is None else cutoff
     grid, (qpos, qvel) = _even(log, (log.qpos, log.qvel))
     fine = float(grid[1] - grid[0])

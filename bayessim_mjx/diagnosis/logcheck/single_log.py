@@ -46,7 +46,7 @@ def size(log: Log, dt: float) -> Iterator[Finding]:
 
 
 def jitter(log: Log, dt: float) -> Iterator[Finding]:
-    """Steps of time more than a fifth off their median."""
+    """Count steps of time more than a fifth off their median."""
     steps = np.diff(log.time)
     off = float(np.mean(np.abs(steps / log.period - 1.0) > 0.2))
     if off > 0.1:

@@ -75,7 +75,7 @@ def pooled(each: Iterable[tuple[str, Late]]) -> dict[str, Late]:
 
 
 def nearest(lags: Array, explained: Array, allowed: NDArray[np.bool_], count: float) -> Late:
-    """The smallest lag that is about as good as the best of those allowed.
+    """Return the smallest lag that is about as good as the best of those allowed.
 
     Args:
         lags: `[L]` s, even; explained: `[L]`, share of the variance; allowed: `[L]`.

@@ -41,7 +41,7 @@ def lines(look: Look) -> list[str]:
 
 
 def verdict(look: Look) -> str:
-    """The actuators' channel and the mechanism apart, in one sentence; nothing where no effort was measured."""
+    """Tell the actuators' channel and the mechanism apart, in one sentence; nothing where no effort was measured."""
     if not look.channels:
         return ""
     shown = [c for c in look.channels if c.identified]

@@ -127,7 +127,7 @@ class Held:
 
 
 def normal_quantile() -> float:
-    """The normal deviate beyond which, on either side, chance is as rare as false discoveries."""
+    """Return the normal deviate beyond which, on either side, chance is as rare as false discoveries."""
     from scipy.special import ndtri
 
     return float(-ndtri(FALSE / 2))
@@ -210,7 +210,7 @@ def blocks(log: Groups, start: Groups, steps: int) -> Groups:
 
 
 def _elsewhere(inputs: Inputs, joint: int, quantity: str) -> Inputs:
-    """The inputs, of which one comes from other windows."""
+    """Return the inputs, of which one comes from other windows."""
     values = np.array(inputs.of(quantity))
     values[:, :, joint] = np.random.default_rng(0).permutation(values[:, :, joint])
     return replace(inputs, **{quantity: values})  # type: ignore[arg-type]

@@ -49,7 +49,7 @@ class Linear:
 
 
 def linearise(fitter: Fitter, fit: Fit, knots: int | None = None, D: Array | None = None) -> Linear:
-    """The residuals' linear model about a fit.
+    """Return the residuals' linear model about a fit.
 
     Args:
         knots: m, None: as many as are cheap; D: columns of another fit of these windows, to save the simulations.
@@ -91,7 +91,7 @@ class Disturbance:
 
 
 def estimate(fitter: Fitter, fit: Fit, linear: Linear | None = None) -> Disturbance:
-    """The smooth force that a fit's residuals make likely; `linear`: of this fit, None: made here.
+    """Return the smooth force that a fit's residuals make likely; `linear`: of this fit, None: made here.
 
     With the prior covariance R R' of the force and its posterior covariance R C R', the mean is R (1 - C) R^-1 times a
     true force. The residuals are linearised anew about a first estimate.
@@ -239,7 +239,7 @@ def _likeliest(K: Array, r: Array, weight: Array) -> tuple[float, Array]:
 
 
 def _white(r: Array, rate: Array) -> tuple[Array, Array]:
-    """What differs from row to row, from second differences of residuals `[W, steps, channels]`.
+    """Return the noise from row to row, from second differences of residuals `[W, steps, channels]`.
 
     Returns:
         (`[channels]` variances, no less than what 5 % of the noise's prior are below, `[W, steps, channels]` what one

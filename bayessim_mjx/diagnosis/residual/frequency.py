@@ -46,7 +46,7 @@ class Spectra:
     square: Array
 
     def pooled(self, weight: Array | None = None) -> tuple[Array, Array, NDArray[np.complex128]]:
-        """Sums over segments with weights."""
+        """Sum over segments with weights."""
         w = np.ones(len(self.xx)) if weight is None else weight
         return w @ self.xx, w @ self.yy, w @ self.xy
 
@@ -206,7 +206,7 @@ class Heard:
 
 
 def analyse(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None) -> tuple[Heard, ...]:
-    """What the spectra of effort, motion and missing force show, joint by joint.
+    """Return the findings in the spectra of effort, motion and missing force, joint by joint.
 
     Simulated motion is that of the windows, put together: it starts at the measured state in each of them, so that what
     accumulates over longer times than a window does not show. The equivalent delay therefore comes from forces: effort

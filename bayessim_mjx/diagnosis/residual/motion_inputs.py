@@ -255,6 +255,6 @@ class Features:
 
 
 def _spread(values: Array) -> Array:
-    """Standard deviations over windows and steps, infinite of what does not change."""
+    """Return standard deviations over windows and steps, infinite of what does not change."""
     sd = values.std((0, 1))
     return np.where(sd > np.finfo(np.float32).eps * np.abs(values).max((0, 1)), sd, np.inf)

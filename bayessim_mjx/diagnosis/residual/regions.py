@@ -152,7 +152,7 @@ SPLITS = {
 
 
 def tree(node: Nodes, group: NDArray[np.int64]) -> Tree:
-    """The tree, of either kind of force, that predicts the force of held-out groups.
+    """Return the tree, of either kind of force, that predicts the force of held-out groups.
 
     The shallowest one that says as much; the search ends where neither one nor two more levels say more.
     """

@@ -38,7 +38,7 @@ class Bound:
 
 
 def widened(state: SearchState, model: Model, say: Progress) -> Model:
-    """The model with ranges as wide as it takes for its effects' parameters to lie within, refitted.
+    """Return the model with ranges as wide as it takes for its effects' parameters to lie within, refitted.
 
     A range doubles as long as a still wider one promises strong held-out evidence (`Odds.strong`), up to as many times
     as the smallest usual size is below it (`Priors.sizes`). What has brought it is kept. A range stays where its end
@@ -110,7 +110,7 @@ def _farthest(physics: Physics, coordinate: Coordinate, end: str) -> float:
 
 
 def _moved(state: SearchState, model: Model, change: Change) -> list[Candidate]:
-    """The model's effects with their ranges changed; the same objects where nothing is."""
+    """Return the model's effects with their ranges changed; the same objects where nothing is."""
     physics, out = state.fitter.simulator.physics, []
     for effect in model.effects:
         pairs = zip(effect.coordinates, model.values_of(effect), strict=True)
@@ -151,7 +151,7 @@ def _refitted(state: SearchState, model: Model, effects: Sequence[Candidate]) ->
 
 
 def _adopt(state: SearchState, new: Model) -> None:
-    """The state with a model's effects in their new ranges; what was fitted with the old ones stays as it is."""
+    """Return the state with a model's effects in their new ranges; what was fitted with the old ones stays as it is."""
     own = {e.label: e for e in new.effects}
     state.models[frozenset(own)] = new
     state.candidates = [own.get(c.label, c) for c in state.candidates]
@@ -159,7 +159,7 @@ def _adopt(state: SearchState, new: Model) -> None:
 
 
 def spread_out(covariance: np.ndarray, values: np.ndarray, neutral: np.ndarray, at: Sequence[int]) -> np.ndarray:
-    """A covariance `[k, k]` that says of the parameters `at` a bound no more than that they are not neutral."""
+    """Return a covariance `[k, k]` that says of the parameters `at` a bound no more than that they are not neutral."""
     out = covariance.copy()
     for i in at:
         out[i, :] = out[:, i] = 0.0

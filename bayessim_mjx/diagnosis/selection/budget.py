@@ -48,7 +48,7 @@ class Budget:
         return self.spent > ENDS["stages"] * self.seconds
 
     def searching(self) -> Budget:
-        """The budget of a search that begins now."""
+        """Return the budget of a search that begins now."""
         return replace(self, fixed=min(self.spent, self.seconds)) if self.limited else self
 
     def left(self, part: str) -> float:
@@ -63,5 +63,5 @@ class Budget:
 
 
 def begun(minutes: float | None) -> Budget:
-    """A budget that begins now; None: no limit."""
+    """Return a budget that begins now; None: no limit."""
     return Budget() if minutes is None else Budget(60.0 * minutes, time.monotonic())

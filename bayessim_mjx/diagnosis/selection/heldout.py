@@ -124,7 +124,7 @@ def noise_floor(fitter: Fitter, fit: Fit, noise: Array) -> Array:
 
 
 def nominal(fitter: Fitter, fit: Fit) -> Prediction:
-    """The simulator as delivered, starts estimated."""
+    """Simulate as delivered, starts estimated."""
     theta = fitter.vector(fit.coordinates, np.array([c.neutral for c in fit.coordinates]))
     return _settled(fitter, fit, theta[None], np.zeros(len(fit.r), int))
 
@@ -179,7 +179,7 @@ class Closed:
     every: Array | None = None
 
     def _sums(self, rows: Array) -> tuple[Array, Array, Array]:
-        """Sums of what there was, what is left and of the noise, over windows with weights `[..., W]`."""
+        """Return sums of what there was, what is left and of the noise, over windows with weights `[..., W]`."""
         before, after = rows @ self.before, rows @ self.after
         noise = rows.sum(-1) if self.floor is None else rows @ self.floor
         if self.own is None or self.every is None:

@@ -50,13 +50,13 @@ class Model:
         return len(self.fit.coordinates)
 
     def values_of(self, candidate: Candidate) -> Array:
-        """The candidate's parameters in this model, `[k]`."""
+        """Return the candidate's parameters in this model, `[k]`."""
         own = [self.fit.names.index(c.name) for c in candidate.coordinates]
         return self.fit.values[own]
 
 
 def scored(fitter: Fitter, fit: Fit, effects: Sequence[Candidate]) -> Model:
-    """The held-out score of a fit."""
+    """Return the held-out score of a fit."""
     plain, moves = fitter.scores(fit)
     cost = fitter.innovations(fit, moves, fit.values + moves, plain)
     costs = np.maximum(cost, 1e-9), np.maximum(plain, 1e-9)
@@ -93,7 +93,7 @@ def of_noise(fitter: Fitter, model: Model) -> Array:
 
 
 def systematic(model: Model, period: float, known: bool = False) -> Array:
-    """Standard deviations `[k]` of what simulators differ by, whatever the data: of effects' numbers.
+    """Return standard deviations `[k]` of the differences between simulators, whatever the data: of effects' numbers.
 
     That of known parameters is in their posterior (`evidence`).
 

@@ -54,7 +54,7 @@ def looked_at(fit: Fit, limit: int) -> NDArray[np.int64]:
 
 
 def part(fit: Fit, own: NDArray[np.int64]) -> Fit:
-    """The fit on some of its windows."""
+    """Return the fit on some of its windows."""
     return replace(fit, offsets=fit.offsets[own], r=fit.r[own], A=fit.A[own], B=fit.B[own], weight=fit.weight[own])
 
 
@@ -92,7 +92,7 @@ class Projection:
         return s_aa - float(s_ab @ along), g_a - float(s_ab @ (self.inverse @ self.slope)), s_aa, projected * self.root
 
     def taken(self, a: Array, share: float) -> Array | None:
-        """Steps `[k]` of the fit's numbers that do the work of a column `[W, n]`; None where they do less of it."""
+        """Return steps `[k]` of the fit's numbers that do the work of a column `[W, n]`; None where they do less."""
         s, _, s_aa, _ = self.moments(a)
         if s_aa <= 0 or s_aa - s <= share * s_aa:
             return None
@@ -133,7 +133,7 @@ class Column:
         return float(sum(c.precision * w**2 for c, w in zip(self.candidate.coordinates, self.way, strict=True)))
 
     def at(self, amount: float) -> Array:
-        """The point so many ways from neutral, within the ranges, and not at neutral, where many laws have no slope."""
+        """Move a point so many ways from neutral, within the ranges and off neutral, where many laws have no slope."""
         low, high, neutral = self._ends()
         amount = amount if abs(amount) > 0.02 else 0.02
         return np.clip(np.where(self.candidate.shapes, self.point, neutral + amount * self.way), low, high)
@@ -162,7 +162,7 @@ class Secants:
     columns: dict[str, list[Column]] = field(default_factory=dict)
 
     def of(self, candidates: Iterable[Candidate]) -> list[Column]:
-        """The columns of some candidates, in ranges as wide as they are by now."""
+        """Return the columns of some candidates, in ranges as wide as they are by now."""
         return [replace(own, candidate=c) for c in candidates for own in self.columns.get(c.label, ())]
 
 
@@ -196,7 +196,7 @@ def screen(
 
 
 def _spread(plans: Sequence[Plan]) -> list[Plan]:
-    """The middle one first, then those halfway between, and so on: however many are simulated, they lie apart."""
+    """Order: the middle one first, then those halfway between, and so on: any number of them lies apart."""
     bits = len(plans).bit_length()
 
     def place(i: int) -> int:
@@ -213,7 +213,7 @@ def simulated(
     say: Progress,
     over: Callable[[], bool] | None = None,
 ) -> Iterator[Column]:
-    """What candidates at starting points change of the residual of some windows `own`."""
+    """Return the changes by candidates at starting points of the residual of some windows `own`."""
     some = part(fit, own)
     at_once = max(EFFORT.batch * fitter.simulator.lanes // len(own), 1)  # whole calls of the compiled program
     for first in range(0, len(plans), at_once):
@@ -242,7 +242,7 @@ def judged(
 
 
 def _with_others(found: list[tuple[Screened, Array]]) -> Screened:
-    """The best start, with the best that differs in what it moves or in its shape, and the best at other levels.
+    """Return the best start, with the best that differs in what it moves or in its shape, and the best at other levels.
 
     The point that leaves least as it was simulated comes too: a secant says little of laws that act beyond a threshold.
     """

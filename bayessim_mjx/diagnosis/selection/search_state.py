@@ -74,7 +74,7 @@ class SearchState:
         return self.gap(model).rms > FLOOR * (self.settings.believed if model.effects else 1.0)
 
     def gap(self, model: Model) -> Gap:
-        """The gap between the base model and `model`, on held-out windows."""
+        """Return the gap between the base model and `model`, on held-out windows."""
         return Gap(self.base.total, model.total, self.noise * len(model.cost))
 
     def log_prior(self, key: Key) -> float:
@@ -87,7 +87,7 @@ class SearchState:
         return contacts(self.fitter.simulator.physics)
 
     def begun(self, fit: Fit) -> Fit:
-        """The fit from which models with more effects begin: with contacts at measured start states, if it left them.
+        """Return the fit from which models with more effects begin: with contacts at measured start states.
 
         A fit that lacks an effect may move its start states farther than their noise. Over contacts no step leads back,
         and the effect would find nothing to explain.

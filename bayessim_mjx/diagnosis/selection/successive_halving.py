@@ -161,7 +161,7 @@ def _fit_batch(
 def _gaining(
     state: SearchState, part: Fitter, own: NDArray[np.int64], fits: Mapping[Key, Fit], parents: Parents
 ) -> list[Key]:
-    """The models whose likelihood gains more on a subset of the windows than the prior odds of their effects."""
+    """Return the models whose likelihood gains more on a subset of the windows than the prior odds of their effects."""
     share, out = len(own) / len(state.base.fit.r), []
     for key, fit in fits.items():
         parent = parents.get(key)
@@ -194,12 +194,12 @@ class WindowSubset:
 
 
 def ranked_on(fit: Fit) -> NDArray[np.int64] | None:
-    """The windows on which extensions of a fit are ranked; None: all, as there are few."""
+    """Return the windows on which extensions of a fit are ranked; None: all, as there are few."""
     return looked_at(fit, EFFORT.windows // 2) if len(fit.r) >= EFFORT.windows else None
 
 
 def fitter_on(fitter: Fitter, own: NDArray[np.int64]) -> Fitter:
-    """The fitter on some of its windows; it uses the same journal, but stores no columns there."""
+    """Return the fitter on some of its windows; it uses the same journal, but stores no columns there."""
     some: Any = WindowSubset(fitter.simulator, own)
     plain = Fitter(some, fitter.base, fitter.theta)
     journal = fitter.journal if isinstance(fitter, Remembering) else None
@@ -207,18 +207,18 @@ def fitter_on(fitter: Fitter, own: NDArray[np.int64]) -> Fitter:
 
 
 def cut(fit: Fit, own: NDArray[np.int64]) -> Fit:
-    """The start of a fit to some of the windows."""
+    """Return the start of a fit to some of the windows."""
     return replace(part(fit, own), cost=np.inf, history=(), reach=np.ones(1))
 
 
 def cost_on(part: Fitter, fit: Fit, own: NDArray[np.int64]) -> float:
-    """The cost on some windows of a fit to all windows."""
+    """Return the cost on some windows of a fit to all windows."""
     some = cut(fit, own)
     return part.cost(some, some.r, some.offsets, some.values)
 
 
 def back(fit: Fit, ranked: Fit, own: NDArray[np.int64]) -> Fit:
-    """The start of a fit to all windows at the values of `ranked`, a fit to some; its first step gives residuals."""
+    """Return the start of a fit to all windows at the values of `ranked`, a fit to some; its first step simulates."""
     offsets = fit.offsets.copy()
     offsets[own] = ranked.offsets
     return replace(fit, values=ranked.values, offsets=offsets, cost=np.inf, history=(), reach=np.ones(1))
@@ -268,7 +268,7 @@ def begin(
 
 
 def _affordable(candidates: Sequence[Candidate], settings: Settings, seconds: float) -> Settings:
-    """Settings with fewer windows for screening if time is limited; seconds: of one simulation of one window."""
+    """Return settings with fewer windows for screening if time is limited; seconds: of one simulation of one window."""
     budget = settings.budget
     if not budget.limited:
         return settings
@@ -322,14 +322,14 @@ def _to_the_end(state: SearchState, fits: Sequence[Fit], counted: Callable[[Fit]
 
 
 def _again(state: SearchState, fit: Fit) -> Fit:
-    """A fit with contacts, from its own start states and from the measured ones; the better of both."""
+    """Return a fit with contacts, from its own start states and from the measured ones; the better of both."""
     both = {id(f): replace(f, history=()) for f in (fit, state.begun(fit))}
     found = state.fitter.iterate(list(both.values()), EFFORT.steps, lambda f: range(len(f.values)), RELEVANCE.share)
     return min(map(state.fitter.refresh, found), key=lambda f: f.cost)
 
 
 def cut_back(state: SearchState, model: Model, kept: Sequence[Candidate]) -> Fit:
-    """The start of a fit with some of a model's effects, at the model's values; its first step gives its residuals."""
+    """Return the start of a fit with some of a model's effects, at the model's values; its first step simulates."""
     fit, base = model.fit, len(state.fitter.base)
     names = {c.name for e in kept for c in e.coordinates}
     own = [i for i, c in enumerate(fit.coordinates) if i < base or c.name in names]
