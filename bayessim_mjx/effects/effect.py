@@ -60,6 +60,7 @@ class Effect(abc.ABC):
     # whether a diagnosis has it act on commands behind the others: a pure delay commutes with each of them, but by part
     # of a sub-step it mixes two commands, which what is not linear has to see one by one
     last: ClassVar[bool] = False
+    relative: ClassVar[bool] = False  # its number multiplies one that the model has (kp)
     # whether its number is a time by which a signal of its joint is late
     late: ClassVar[bool] = False
     offered: ClassVar[bool] = True  # among all the effects that a diagnosis tries; else only where it is named

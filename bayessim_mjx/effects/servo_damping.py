@@ -21,6 +21,7 @@ class ServoDamping(Effect):
 
     name: ClassVar[str] = "servo_damping"
     kind: ClassVar[str] = "actuator"
+    relative: ClassVar[bool] = True
     noun: ClassVar[str] = "wrong servo damping (kv)"
     lacks: ClassVar[str] = "the true servo damping (kv)"
     separates: ClassVar[str] = "motion by hand with the drive off: what damps it then is the joint's, not the servo's"

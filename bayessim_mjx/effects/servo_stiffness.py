@@ -21,6 +21,7 @@ class ServoStiffness(Effect):
 
     name: ClassVar[str] = "servo_stiffness"
     kind: ClassVar[str] = "actuator"
+    relative: ClassVar[bool] = True
     noun: ClassVar[str] = "wrong servo stiffness (kp)"
     lacks: ClassVar[str] = "the true servo stiffness (kp)"
     separates: ClassVar[str] = "a known load on the servo at rest: the position error times kp is its torque"

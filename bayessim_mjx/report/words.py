@@ -119,9 +119,14 @@ def stages_of(d: Diagnosis) -> dict[str, float]:
 
 
 def between(low: Any, high: Any) -> str:
-    """`96 % – 99.9 %`: the ends of an interval of shares; with more digits where they would look the same."""
+    """`96 % – 99.9 %`: the ends of an interval of shares; with more digits where they would look the same.
+
+    One as wide as all shares from 0 to 1, as of two conditions, determines nothing.
+    """
     if not (finite(low) and finite(high)):
         return ""
+    if high - low >= 1:
+        return "not determined"
     ends = [percent(low), percent(high)]
     if ends[0] == ends[1] and low < high:
         places = 1 - quantities.power(100 * (high - low))

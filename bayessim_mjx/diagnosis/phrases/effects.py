@@ -145,6 +145,8 @@ def wrong(effect: FoundEffect) -> str:
         return f"the {name} is not the model's" + (f" ({numbers})" if numbers else "")
     ((_, value),) = (quantity(k, v) for k, v in effect.parameters.items())
     neutral = kind.quantities[0].neutral
+    if kind.relative:
+        return f"the {name} is {value} times the model's"
     return f"the {name} is {value}, not {neutral:g}" if neutral else f"the {name} is off by {value}"
 
 

@@ -86,3 +86,8 @@ def test_a_rival_and_a_parameter_at_its_end():
     assert effects.close_by(3.21, -0.1) == "held-out evidence differs by 3.2 nats, 0 % of the gap"
     text = effects.at_bound(Bound("at most", 0.5), "N m")
     assert text.startswith("ends at 0.5 N m, the smallest value tried: at most")
+
+
+def test_a_servos_gain_is_a_multiple_of_the_models():
+    found = effect("servo_stiffness", "servo", 0.99, factor=(0.35, 0.0065, ""))
+    assert effects.wrong(found) == "the servo stiffness (kp) at servo is 0.3500 +- 0.0065 times the model's"
