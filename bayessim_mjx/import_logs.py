@@ -33,7 +33,8 @@ def _parser() -> cli.PlainParser:
         each.usage = f"{each.prog} PATH [PATH ...] --out DIR [options]"
         each.add_argument("paths", metavar="PATH", nargs="+", help=FORMATS[name])
         each.add_argument("--out", metavar="DIR", required=True, help="folder for the logs, new")
-        each.add_argument("--model", metavar="FILE", help="MJCF model; its names go into the map")
+        each.add_argument("--model", metavar="FILE", help="MJCF or URDF model; its names go into the map")
+        _of_urdf(each)
         each.add_argument(
             "--rename", metavar="A=B", nargs="+", default=[], help="names in the recording, and those in the model"
         )
@@ -55,8 +56,16 @@ def _check(formats: Any, prog: str) -> None:
     parser = formats.add_parser("check", help=text, description=f"Show {text}; write a map.yaml where there is none.")
     parser.usage = f"{prog} check DIR [--model FILE] [--map FILE]"
     parser.add_argument("path", metavar="DIR", help="folder of logs, or one file")
-    parser.add_argument("--model", metavar="FILE", help="MJCF model; it names joints and actuators")
+    parser.add_argument("--model", metavar="FILE", help="MJCF or URDF model; it names joints and actuators")
+    _of_urdf(parser)
     parser.add_argument("--map", metavar="FILE", help="map of the columns (default: map.yaml in the folder)")
+
+
+def _of_urdf(parser: argparse.ArgumentParser) -> None:
+    text = "actuators of a model that has none (URDF): torque, position:KP,KV, velocity:KV, or a YAML file by joint"
+    parser.add_argument("--drive", metavar="KIND", help=text)
+    text = "where package://NAME/ of a URDF is: NAME=FOLDER, or a folder of packages (default: above the file)"
+    parser.add_argument("--packages", metavar="DIR", nargs="+", default=[], help=text)
 
 
 def _ros(parser: argparse.ArgumentParser) -> None:
@@ -152,7 +161,7 @@ def _logs(argv: Sequence[str] | None) -> int:
     cli.writable(args.out, "--out")
     from bayessim_mjx.logs.importers.folder import Target
 
-    model = _model(args.model)
+    model = _model(args)
     target = Target(Path(args.out), model, _pairs(args.rename), scale, of_commands)
     written = target.write(_recordings(args, model))
     for note in target.notes:
@@ -168,7 +177,7 @@ def _checked(args: argparse.Namespace) -> int:
     from bayessim_mjx.logs.overview import overview
 
     path = Path(args.path)
-    found = overview(path, _model(args.model), args.map)
+    found = overview(path, _model(args), args.map)
     _table(("column", "channel", "unit", "values", "note"), found.columns)
     _table(("file", "rows", "length", "rate", "jitter", "gaps"), found.files)
     for note in found.notes:
@@ -178,7 +187,11 @@ def _checked(args: argparse.Namespace) -> int:
     for what in found.missing:
         print(f"missing: {what}")
     if not found.missing:
-        print(f"nothing is missing; next: bayessim-mjx diagnose --model {args.model} --data {path}")
+        own = [f"--drive {args.drive}"] if args.drive else []
+        own += [f"--packages {' '.join(args.packages)}"] if args.packages else []
+        print(
+            " ".join(["nothing is missing; next: bayessim-mjx diagnose --model", args.model, *own, "--data", str(path)])
+        )
     return 2 if found.missing else 0
 
 
@@ -220,12 +233,12 @@ def _scales(args: argparse.Namespace) -> tuple[float, float]:
     return scale, of_commands
 
 
-def _model(path: str | None) -> Any:
-    if path is None:
+def _model(args: argparse.Namespace) -> Any:
+    if args.model is None:
         return None
     from bayessim_mjx.diagnosis.fitting import robot
 
-    return robot.of_file(path).mj_model
+    return robot.of_file(args.model, None, args.drive, args.packages).mj_model
 
 
 main = cli.command(_logs)

@@ -1,0 +1,22 @@
+"""Logs of a robot whose model is a URDF without actuators."""
+
+from bayessim_mjx import import_logs
+
+URDF = """<robot name="r"><link name="base"/>
+<link name="arm"><inertial><origin xyz="0 0 -0.1"/><mass value="0.5"/>
+<inertia ixx="0.002" iyy="0.002" izz="0.0002" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="elbow" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="3" velocity="6"/></joint></robot>"""
+
+
+def test_a_check_names_drives_and_carries_them_on(tmp_path, capsys):
+    model, logs = tmp_path / "r.urdf", tmp_path / "logs"
+    model.write_text(URDF)
+    logs.mkdir()
+    rows = "".join(f"{0.02 * k:.2f},{0.1 * (k % 7):.1f},{0.003 * k**2 % 1:.4f}\n" for k in range(60))
+    (logs / "a.csv").write_text("time,ctrl:elbow,qpos:elbow\n" + rows)
+    given = ["check", str(logs), "--model", str(model)]
+    assert import_logs.main(given) == 2
+    assert "allowed: --drive torque" in capsys.readouterr().err
+    assert import_logs.main([*given, "--drive", "torque"]) == 0
+    assert f"--model {model} --drive torque --data {logs}" in capsys.readouterr().out
