@@ -80,7 +80,7 @@ def test_what_the_answer_rests_on_comes_with_it(rubbing):
     assert len(selection.estimated.mean) == len(selection.answer.fit.values) == len(selection.estimated.covariance)
     assert set(selection.chosen.values()) == {named}
     assert diagnosis.gap.closed["elsewhere"] == pytest.approx(diagnosis.gap.closed["realised"], abs=0.05)
-    assert any("chosen and fitted without each condition" in text for text in diagnosis.sentences)
+    assert any("Chosen and fitted without each condition" in text for text in diagnosis.sentences)
 
 
 @pytest.mark.ci

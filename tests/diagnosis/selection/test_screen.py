@@ -112,7 +112,7 @@ def test_where_time_ends_first_every_candidate_was_looked_at_before_any_a_second
             continue
         assert min(sizes) == 1 and max(sizes) == 2 and len(found) == count
         for candidate in setup.candidates:
-            first = secants.columns[candidate.label][0][0]
+            first = secants.columns[candidate.label][0].point
             np.testing.assert_array_equal(first, candidate.probes[len(candidate.probes) // 2])
 
 
