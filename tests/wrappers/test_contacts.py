@@ -93,7 +93,7 @@ def collected(env):
     one = np.ones(1), nominal[None], 0 * nominal[None]
     source = Surrogate(env, env.space, *one, "policy_random", 3, 0.0, summarizers.get("start"))
     prior = Distribution.prior(env.space, 1)
-    _, x, _ = trajectories.simulated(source, jax.random.PRNGKey(0), policy(env), prior, "prior", WORLDS)
+    _, x, _ = trajectories.simulated(source, jax.random.PRNGKey(0), policy(env), prior.sample, WORLDS)
     return float(np.isfinite(x).all())
 
 
