@@ -26,7 +26,10 @@ def test_probabilities_come_with_the_answer(diagnosed):
     assert told[named]["probability"] > 0.99 and told[named]["nats"] > 50
     assert told[frozenset()]["nats"] == 0 and told[frozenset()]["probability"] < 1e-6
     assert sum(e["probability"] for e in diagnosed.evidence) == pytest.approx(1.0, abs=2e-3)
-    assert any("Probability among all fitted explanations" in text and "one in a million" in text for text in diagnosed.sentences)
+    assert any(
+        "Probability among all fitted explanations" in text and "one in a million" in text
+        for text in diagnosed.sentences
+    )
 
 
 @pytest.mark.slow
