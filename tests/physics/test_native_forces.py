@@ -6,6 +6,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.effects import make
+from bayessim_mjx.effects.support.native import write_model
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.physics import Physics
@@ -109,3 +110,12 @@ def test_a_servos_gain_times_a_factor_is_another_servo(name, change):
 def test_a_motor_has_no_servo_gains():
     with pytest.raises(UserError, match=r"servo_stiffness: actuator 'drive' has none of what servo_stiffness changes"):
         make("servo_stiffness", where="drive").bind(mujoco.MjModel.from_xml_string(xml()), 0.01, 1)
+
+
+def test_written_at_all_servos_it_leaves_motors_as_they_are():
+    spec = mujoco.MjSpec.from_string(xml("", SERVO.format("") + '<motor name="plain" joint="hinge" gear="3"/>'))
+    tied = [make("servo_stiffness", where="all")]
+    written, missing = write_model(spec, ParameterSpace(), [], tied, {"all.servo_stiffness.factor": 0.5})
+    model = written.compile()
+    assert not missing and model.actuator_gainprm[0, 0] == 3 and model.actuator_biasprm[0, 1] == -3
+    assert model.actuator_gainprm[1, 0] == 1 and not model.actuator_biasprm[1].any()

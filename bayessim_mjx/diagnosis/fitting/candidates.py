@@ -134,7 +134,7 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
     """One Effect per kind over all of its places, each with values and ranges of its own; and what is left out."""
     made, left_out = [], []
     for kind in kinds:
-        found = tuple(p for p in places(kind.kind, scales.model) if _alive(kind, p, scales))
+        found = tuple(p for p in places(kind, scales.model) if _alive(kind, p, scales))
         if not found:
             left_out.append(f"{kind.name}: no {kind.kind} here that could carry it and was excited")
             continue
@@ -152,8 +152,6 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
 def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:
     """Joints that never moved tell nothing of what happens in them; nor do contacts of a model without contacts."""
     model = scales.model
-    if not kind.carries(model, element_names(model, kind.kind).index(place)):
-        return False
     if kind.kind == "joint":
         joint = element_names(model, "joint").index(place)
         return bool(scales.moves[model.jnt_dofadr[joint]])

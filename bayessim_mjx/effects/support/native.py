@@ -9,7 +9,6 @@ from typing import Any
 import mujoco
 
 from bayessim_mjx.effects.effect import Effect
-from bayessim_mjx.effects.support import site
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 
@@ -53,9 +52,9 @@ def _add(spec: mujoco.MjSpec, effect: Effect, values: Values) -> tuple[mujoco.Mj
     """(spec with the effect, None), or (the spec as it was, why it is not in there)."""
     new = spec.copy()
     model = new.compile()
-    effect.bind(model, float(model.opt.timestep), 1)  # refuses unknown places
+    at = effect.bind(model, float(model.opt.timestep), 1)  # refuses unknown places
     if effect.where == "all":
-        values = {place: values["all"] for place in site.places(effect.kind, model)}
+        values = {place: values["all"] for place in at.names}
     _name(new, effect.kind, values)
     try:
         why = effect.edit(new, values)

@@ -16,19 +16,24 @@ _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLI
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
-class Placed(Protocol):
+class Carried(Protocol):
+    """What an effect, or its class, says of the elements that can carry it."""
+
+    @property
+    def kind(self) -> str: ...
+    def carries(self, model: mujoco.MjModel, i: int) -> bool: ...
+
+
+class Placed(Carried, Protocol):
     """What an effect says of its places."""
 
     @property
     def name(self) -> str: ...
     @property
-    def kind(self) -> str: ...
-    @property
     def where(self) -> str | tuple[str, ...]: ...
     @property
     def quantities(self) -> Sequence[Any]: ...
     def places(self) -> tuple[str, ...]: ...
-    def carries(self, model: mujoco.MjModel, i: int) -> bool: ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -91,7 +96,7 @@ def find(effect: Placed, model: mujoco.MjModel, timestep: float, substeps: int) 
     """Find the site of `effect`; UserError where a place is not in the model or cannot carry it."""
     kind = effect.kind
     names = element_names(model, kind)
-    usable = [i for i in range(len(names)) if _usable(model, kind, i) and effect.carries(model, i)]
+    usable = _carriers(effect, model)
     if effect.where == "all":
         ids = np.asarray(usable, int)
         if not len(ids):
@@ -116,10 +121,16 @@ def find(effect: Placed, model: mujoco.MjModel, timestep: float, substeps: int) 
     )
 
 
-def places(effect_kind: str, model: mujoco.MjModel) -> tuple[str, ...]:
-    """Names of all elements of the model that can carry an effect of this kind."""
-    names = element_names(model, effect_kind)
-    return tuple(n for i, n in enumerate(names) if _usable(model, effect_kind, i))
+def places(effect: Carried, model: mujoco.MjModel) -> tuple[str, ...]:
+    """Return the names of all elements of the model that can carry the effect."""
+    names = element_names(model, effect.kind)
+    return tuple(names[i] for i in _carriers(effect, model))
+
+
+def _carriers(effect: Carried, model: mujoco.MjModel) -> list[int]:
+    """Return the ids of the elements that can carry an effect."""
+    count = len(element_names(model, effect.kind))
+    return [i for i in range(count) if _usable(model, effect.kind, i) and effect.carries(model, i)]
 
 
 def element_names(model: mujoco.MjModel, kind: str) -> list[str]:
