@@ -37,10 +37,7 @@ def _parser() -> cli.PlainParser:
     text = "name of a task, or file.py:Class (bayessim-mjx main --list_tasks)"
     robot.add_argument("--task", metavar="TASK", type=cli.task, help=text)
     robot.add_argument("--model", metavar="FILE", help="an MJCF or URDF model with hinge or slide joints")
-    text = "actuators of a model that has none (URDF): torque, position:KP,KV, velocity:KV, or a YAML file by joint"
-    robot.add_argument("--drive", metavar="KIND", help=text)
-    text = "where package://NAME/ of a URDF is: NAME=FOLDER, or a folder of packages (default: above the file)"
-    robot.add_argument("--packages", metavar="DIR", nargs="+", default=[], help=text)
+    cli.of_urdf(robot)
     robot.add_argument("--data", metavar="PATH", nargs="+", help="log files, or folders of them (docs/logs.md)")
     text = "YAML file that maps the columns of the logs to the model (docs/logs.md)"
     robot.add_argument("--map", metavar="FILE", help=text)

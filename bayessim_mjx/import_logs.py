@@ -34,7 +34,7 @@ def _parser() -> cli.PlainParser:
         each.add_argument("paths", metavar="PATH", nargs="+", help=FORMATS[name])
         each.add_argument("--out", metavar="DIR", required=True, help="folder for the logs, new")
         each.add_argument("--model", metavar="FILE", help="MJCF or URDF model; its names go into the map")
-        _of_urdf(each)
+        cli.of_urdf(each)
         each.add_argument(
             "--rename", metavar="A=B", nargs="+", default=[], help="names in the recording, and those in the model"
         )
@@ -57,15 +57,8 @@ def _check(formats: Any, prog: str) -> None:
     parser.usage = f"{prog} check DIR [--model FILE] [--map FILE]"
     parser.add_argument("path", metavar="DIR", help="folder of logs, or one file")
     parser.add_argument("--model", metavar="FILE", help="MJCF or URDF model; it names joints and actuators")
-    _of_urdf(parser)
+    cli.of_urdf(parser)
     parser.add_argument("--map", metavar="FILE", help="map of the columns (default: map.yaml in the folder)")
-
-
-def _of_urdf(parser: argparse.ArgumentParser) -> None:
-    text = "actuators of a model that has none (URDF): torque, position:KP,KV, velocity:KV, or a YAML file by joint"
-    parser.add_argument("--drive", metavar="KIND", help=text)
-    text = "where package://NAME/ of a URDF is: NAME=FOLDER, or a folder of packages (default: above the file)"
-    parser.add_argument("--packages", metavar="DIR", nargs="+", default=[], help=text)
 
 
 def _ros(parser: argparse.ArgumentParser) -> None:

@@ -145,3 +145,11 @@ class Allow(argparse.Action):
             raise UserError(f"{option} {value}: no such file; give the Python file that is to run")
         trust.allow([value])
         setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
+
+
+def of_urdf(group: Any) -> None:
+    """Add the flags that a URDF needs to a parser, or to a group of its flags."""
+    text = "actuators of a model that has none (URDF): torque, position:KP,KV, velocity:KV, or a YAML file by joint"
+    group.add_argument("--drive", metavar="KIND", help=text)
+    text = "where package://NAME/ of a URDF is: NAME=FOLDER, or a folder of packages (default: above the file)"
+    group.add_argument("--packages", metavar="DIR", nargs="+", default=[], help=text)

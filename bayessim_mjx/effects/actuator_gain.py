@@ -7,7 +7,7 @@ import jax
 import mujoco
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.actuators import addressed, nonlinear
+from bayessim_mjx.effects.support.actuators import nonlinear, with_bias
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
@@ -41,10 +41,8 @@ class ActuatorGain(Effect):
         """Native: gainprm, biasprm and forcerange, times gain."""
         if why := nonlinear(spec, values):
             return why
-        compiled = spec.copy().compile()  # its biasprm has the damping that a dampratio stands for
-        order = list(spec.actuators)
-        for actuator, own in addressed(spec, values):
+        for actuator, own in with_bias(spec, values):
             actuator.gainprm = own["gain"] * actuator.gainprm
-            actuator.biasprm = own["gain"] * compiled.actuator_biasprm[order.index(actuator)]
+            actuator.biasprm = own["gain"] * actuator.biasprm
             actuator.forcerange = own["gain"] * actuator.forcerange
         return None

@@ -79,14 +79,11 @@ class ActuatorGain(ActuatorCause):
         return {"gain": 1 + self.sign * self.size}
 
 
-class ServoStiffness(ActuatorCause):
+class ServoStiffness(ActuatorGain):
     """The servo's kp alone; its kv and force limit are the model's."""
 
     name = "servo_stiffness"
     largest = 0.7
-
-    def draw(self, rng: np.random.Generator) -> None:
-        self.sign = float(rng.choice([-1, 1]))
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         actuator = spec.actuator(self.where)

@@ -140,7 +140,7 @@ class Errors:
     def start(self, sigma: Array) -> None:
         """Fit the start states, until a step gains no more than a squared noise a window.
 
-        Far from the measured motion the time step is worth something else.
+        Far from the measured motion the time step's error is another one.
         """
         here = self.run(self.cut, self.first)
         gained = np.inf

@@ -1,6 +1,6 @@
 """The chain command -> effort -> motion -> measurement, each link tested alone with its measured input and output.
 
-Command -> effort also drive by drive over all logs (`channels_of`): scale, lateness and what is left.
+Command -> effort also drive by drive over all logs (`channels_of`): scale, lateness and residual.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Channel:
         constant, doubt: and its standard deviation, in the unit of the effort; size: of the effort, rms.
         noise: share of the effort that the encoders' noise may make of what a servo is thought to exert.
         cancels: a servo's stiffness over its stiffness and damping together; at least 1.
-        sound: it does what it is told. Of efforts in a unit of their own: as the other drives do.
+        sound: it follows its command. Of efforts in a unit of their own: as the other drives do.
         echo: the logged effort is the command itself, no measurement.
     """
 

@@ -179,7 +179,7 @@ class Closed:
     every: Array | None = None
 
     def _sums(self, rows: Array) -> tuple[Array, Array, Array]:
-        """Return sums of what there was, what is left and of the noise, over windows with weights `[..., W]`."""
+        """Return sums of the gap, of the residual and of the noise, over windows with weights `[..., W]`."""
         before, after = rows @ self.before, rows @ self.after
         noise = rows.sum(-1) if self.floor is None else rows @ self.floor
         if self.own is None or self.every is None:

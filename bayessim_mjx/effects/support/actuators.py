@@ -1,7 +1,7 @@
 """Actuators of a spec by place, and what follows a command, shared by the effects on actuators."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -39,9 +39,29 @@ def servo(model: mujoco.MjModel, actuator: int) -> bool:
     )
 
 
-def scaled(numbers: jax.Array, ids: np.ndarray, column: int, factor: jax.Array) -> jax.Array:
-    """`[nu, k]` numbers of actuators, one column of those at `ids` `[n]` times `factor` `[n]`."""
-    return numbers.at[ids, column].multiply(factor)
+def with_bias(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> list[tuple[Any, dict[str, float]]]:
+    """Return `addressed`, the actuators' biasprm with the damping in place that a dampratio stands for."""
+    compiled, order, found = spec.copy().compile(), list(spec.actuators), addressed(spec, values)
+    for actuator, _ in found:
+        actuator.biasprm = compiled.actuator_biasprm[order.index(actuator)]
+    return found
+
+
+class OfGains:
+    """What effects on an actuator's gains share: `factor` multiplies `columns` {field of the model: column}."""
+
+    columns: ClassVar[dict[str, int]]
+
+    def on_model(self, at: Site, model: Any, theta: jax.Array) -> Any:
+        factor = at.values(theta)[:, 0]
+        return model.replace(**{f: getattr(model, f).at[at.ids, k].multiply(factor) for f, k in self.columns.items()})
+
+    def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
+        """Native: the columns, times factor."""
+        for actuator, own in with_bias(spec, values):
+            for field, k in self.columns.items():
+                getattr(actuator, field.removeprefix("actuator_"))[k] *= own["factor"]
+        return None
 
 
 def limits(actuator: Any) -> np.ndarray | None:
