@@ -63,6 +63,7 @@ class FoundEffect:
             effects it is (mixture of their posteriors by probability, 90 % interval); {} where they share no unit.
         sentence: for people; predicted_gap_closed: the same share as promised before any effect was fitted.
         share: of the gap closed by all effects together (Shapley).
+        modelled: {parameter: the model's own number that it multiplies}, of a servo's gains.
     """
 
     name: str
@@ -76,6 +77,7 @@ class FoundEffect:
     predicted_gap_closed: float = math.nan
     share: float = math.nan
     shared: dict[str, Any] = dataclasses.field(default_factory=dict)
+    modelled: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
 REACH = 4.0  # sd that a range holds on both sides, where physics allows: all but 6e-5 of a Gaussian; source: its tails

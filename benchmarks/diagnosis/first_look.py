@@ -22,17 +22,19 @@ from rigs import Rig, draw, record
 SYSTEMS = ("pendulum", "cartpole", "two_link", "leg", "arm_torque", "arm_servo")
 EFFECTS = (
     "", "payload", "actuator_gain", "gain_everywhere", "coulomb_friction", "friction_everywhere", "viscous_friction",
-    "actuator_bias", "actuator_saturation", "friction_in_each",
+    "actuator_bias", "actuator_saturation", "friction_in_each", "servo_stiffness", "servo_damping",
 )  # fmt: skip
 PERIODS = (0.01, 0.005, 0.002, 0.001)
 VALUES = {"payload": "mass", "actuator_gain": "gain", "coulomb_friction": "level", "viscous_friction": "damping"}
-VALUES |= {"actuator_bias": "bias"}
+VALUES |= {"actuator_bias": "bias", "servo_stiffness": "factor", "servo_damping": "factor"}
 
 
 def rigs(seeds: Sequence[int], systems: Sequence[str] = SYSTEMS, effects: Sequence[str] = EFFECTS) -> list[Rig]:
     """Every system with every effect, each seed with its own rate, noise, resolution and logged effort."""
     out = []
     for seed, (system, effect) in itertools.product(seeds, itertools.product(systems, effects)):
+        if effect.startswith("servo") and system != "arm_servo":
+            continue
         rng = np.random.default_rng((seed, *system.encode(), *effect.encode()))
         truth = draw(system, effect, rng)
         quantum = float(rng.choice([0.0, 2 * np.pi / 4096, 2 * np.pi / 16384]))
@@ -98,7 +100,7 @@ def _error(rig: Rig, start: Any, proposal: Any) -> tuple[float, float]:
     if start is None or key is None:
         return float("nan"), float("nan")
     off, true = start[key] - rig.truth.values[0], rig.truth.values[0]
-    size = abs(true - (1.0 if key == "gain" else 0.0))
+    size = abs(true - (1.0 if key in ("gain", "factor") else 0.0))
     return abs(off) / max(size, 1e-12), off / proposal.deviations[key] if proposal else float("nan")
 
 

@@ -84,6 +84,8 @@ def draw(system: str, effect: str, rng: np.random.Generator) -> Truth:
         return Truth(effect, model.body(body).name, (mass, *(rng.uniform(-0.05, 0.05, 3))))
     if effect == "actuator_gain":
         return Truth(effect, name, (float(rng.choice([1 - share, 1 + share])),))
+    if effect in ("servo_stiffness", "servo_damping"):  # a firmware's gains have no known relation to the model's
+        return Truth(effect, name, (float(np.exp(rng.choice([-1, 1]) * rng.uniform(np.log(1.3), np.log(3.0)))),))
     if effect == "gain_everywhere":
         return Truth("actuator_gain", "all", (float(rng.choice([1 - share, 1 + share])),))
     if effect == "friction_everywhere":
@@ -130,6 +132,11 @@ def _built(rig: Rig, rng: np.random.Generator) -> mujoco.MjModel:
         if on and truth.effect == "actuator_gain":
             model.actuator_gainprm[i] *= truth.values[0]
             model.actuator_biasprm[i] *= truth.values[0]
+        if on and truth.effect == "servo_stiffness":
+            model.actuator_gainprm[i, 0] *= truth.values[0]
+            model.actuator_biasprm[i, 1] *= truth.values[0]
+        if on and truth.effect == "servo_damping":
+            model.actuator_biasprm[i, 2] *= truth.values[0]
         if on and truth.effect == "actuator_bias":
             model.actuator_biastype[i] = int(mujoco.mjtBias.mjBIAS_AFFINE)
             model.actuator_biasprm[i, 0] += truth.values[0]

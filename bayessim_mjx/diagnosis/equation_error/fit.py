@@ -31,12 +31,13 @@ class Term:
 
     Attributes:
         effect, where: of the library, or a known parameter (`mass`, `armature`, `damping`).
-        shape: its maps into the columns; a scale has none.
+        shape: its maps into the columns; a scale has none. bent: coefficients -> the sum of its columns `[nv, P]`, of
+            which the maps are the derivative; None: the maps times the coefficients.
         scaled: `[nv]`, joints whose whole effort it scales (neutral 1); None: it adds (neutral 0).
         rest: `[nv, P]`, effort at these joints that it does not scale, y = rest + k (needed - rest); or None.
         sd: coefficients of the last round -> `[k]` of the priors; inf: none.
         low, high: `[k]`, allowed coefficients; within: further limits.
-        read: coefficients -> parameters of the effect.
+        read: coefficients -> parameters of the effect; modelled: {parameter: the model's own number that it multiplies}.
     """
 
     effect: str
@@ -50,6 +51,8 @@ class Term:
     within: Callable[[Array], bool] = lambda c: True
     read: Callable[[Array], Mapping[str, float]] = lambda c: {}
     rest: Array | None = None
+    bent: Shape | None = None
+    modelled: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -146,7 +149,7 @@ def _effort(layout: Layout, terms: Sequence[Term], spans: Sequence[slice], value
     for term, own in zip(terms, spans, strict=True):
         if term.shape is not None:
             design[:, :, own] = term.shape(values[own])
-            inner += design[:, :, own] @ values[own]
+            inner += design[:, :, own] @ values[own] if term.bent is None else term.bent(values[own])
         elif term.scaled is not None:
             scale[term.scaled] *= values[own][0]
             rest += 0.0 if term.rest is None else (1.0 - values[own][0]) * term.rest

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
 from bayessim_mjx.diagnosis.logcheck.regressor import Mask, Motion, Regressor, filtered, motion
+from bayessim_mjx.effects.support.actuators import OfGains
 from bayessim_mjx.logs.log import Log
 
 Array = NDArray[np.float64]
 OWN = ("acceleration", "speed", "dry", "drag", "position", "one", "load", "effort_load")
 SHIFT = float(np.finfo(float).eps) ** (1 / 3)  # rad or m, of a central difference: rounding and curvature cost as much
+# multiples of a servo's gain at which its effort is computed; between them it is interpolated. A rule of thumb
+GAINS = (0.1, 0.32, 1.0, 3.2, 10.0)
 ROWS = 12000  # of all logs together, at their own rates: seconds, not errors; a choice, not counted
 
 
@@ -25,16 +30,18 @@ class Layout:
     """Where the columns stand: ten of each body, the joint's own (OWN), zeros `[nv]`, drives, tilt [2], and others.
 
     shared: actuators that drive a joint together with others; each has a column of its own effort.
+    gains: (effect, actuator) of servos' gains; each has columns of what the servo's effort gains with each of GAINS.
     """
 
     bodies: int
     nv: int
     shared: tuple[int, ...] = ()
+    gains: tuple[tuple[str, int], ...] = ()
 
     @cached_property
     def _starts(self) -> dict[str, int]:
         kinds = {"body": rigid_body.INERTIAL * self.bodies} | dict.fromkeys(OWN, 1)
-        kinds |= {"zero": self.nv, "drive": len(self.shared), "tilt": 2, "late": 1, "known": 1, "effort": 1, "end": 0}
+        kinds |= {"zero": self.nv, "drive": len(self.shared), "gain": len(GAINS) * len(self.gains), "tilt": 2, "late": 1, "known": 1, "effort": 1, "end": 0}
         return dict(zip(kinds, np.cumsum([0, *kinds.values()]).tolist(), strict=False))
 
     @property
@@ -51,6 +58,10 @@ class Layout:
     def drive(self, actuator: int) -> int:
         """Of one of the actuators `shared`."""
         return self.at("drive") + self.shared.index(actuator)
+
+    def gain(self, effect: str, actuator: int) -> int:
+        """Return the first column of one of the `gains`."""
+        return self.at("gain") + len(GAINS) * self.gains.index((effect, actuator))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +117,13 @@ def layout_of(model: mujoco.MjModel) -> Layout:
     """Return the columns of a model."""
     dofs = [drives.dof_of(model, i) for i in range(model.nu)]
     shared = tuple(i for i, dof in enumerate(dofs) if dof is not None and dofs.count(dof) > 1)
-    return Layout(len(rigid_body.moving_bodies(model)), model.nv, shared)
+    gains = tuple((e.name, i) for e in of_gains() for i, d in enumerate(dofs) if d is not None and e.carries(model, i))
+    return Layout(len(rigid_body.moving_bodies(model)), model.nv, shared, gains)
+
+
+def of_gains() -> list[type[Any]]:
+    """Return the effects of the library that multiply a servo's gain."""
+    return [kind for kind in map(library.load, library.names()) if issubclass(kind, OfGains)]
 
 
 def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Array) -> tuple[Array, Mask, float]:
@@ -134,8 +151,24 @@ def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Arra
         dof = drives.dof_of(model, i)
         if dof is not None and source[dof] in of:
             x[:, dof, layout.drive(i)] = filtered(model.actuator_gear[i, 0] * of[source[dof]][:, i], log, moved)
+    for k, (name, i) in enumerate(layout.gains):
+        dof = drives.dof_of(model, i)
+        if dof is not None and source[dof] == "ctrl":  # a measured effort is what the servo gave, whatever its gains
+            for g, more in enumerate(_by_gain(log, model, library.load(name), i, of["ctrl"][:, i]), len(GAINS) * k):
+                x[:, dof, layout.at("gain") + g] = filtered(model.actuator_gear[i, 0] * more, log, moved)
     rows = np.stack([moved.moving(v) & (source[v] != "") for v in range(model.nv)])
     return x, rows, moved.share
+
+
+def _by_gain(log: Log, model: mujoco.MjModel, effect: type[Any], actuator: int, force: Array) -> Iterator[Array]:
+    """`[T]` of each of GAINS: (force with that multiple of a gain - force) / (multiple - 1); a derivative at 1.
+
+    Without a force limit all are the same.
+    """
+    for factor in GAINS:
+        factor = factor if factor != 1.0 else 1.0 + SHIFT
+        moved = drives.commanded(drives.centred(log), effect.scaled(model, actuator, factor))[:, actuator]
+        yield (moved - force) / (factor - 1.0)
 
 
 def _zeros(model: mujoco.MjModel, moved: Motion) -> dict[int, Array]:

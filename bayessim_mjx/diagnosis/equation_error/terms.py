@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import mujoco
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY
 from bayessim_mjx.diagnosis.equation_error.fit import LEAST, Term
-from bayessim_mjx.diagnosis.equation_error.sums import Layout
+from bayessim_mjx.diagnosis.equation_error.sums import GAINS, SHIFT, Layout
 from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of
 from bayessim_mjx.effects.support.site import element_names
@@ -81,14 +82,16 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
         if np.any(model.jnt_type == 3):
             zero, read = _map(layout, layout.at("zero") + v), _reader("offset", sign=-1.0)
             out.append(_term("joint_offset", name, zero, read, sd=_askew("joint_offset")))
-    out += _on_actuators(model, layout, driven)
+    out += _on_actuators(model, layout, driven, source)
     tilt = np.stack([_map(layout, c) for c in (layout.at("tilt"), layout.at("tilt") + 1)], -1)
     if np.any(model.opt.gravity):
         out.append(_term("gravity_tilt", "world", tilt, _reader("roll", "pitch"), sd=_askew("gravity_tilt")))
     return [*out, *payloads(model, layout, carried), *links(model, layout)]
 
 
-def _on_actuators(model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[int, int]]) -> list[Term]:
+def _on_actuators(
+    model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[int, int]], source: Sequence[str]
+) -> list[Term]:
     out, title = [], element_names(model, "actuator")
     for i, v in driven:
         beside = [_map(layout, layout.drive(j), v) for j, w in driven if w == v and j != i]
@@ -96,10 +99,36 @@ def _on_actuators(model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[
         out.append(scale("actuator_gain", title[i], np.arange(layout.nv) == v, SURE, rest))
         gear = float(model.actuator_gear[i, 0]) or 1.0
         out.append(_term("actuator_bias", title[i], _map(layout, layout.at("one"), v), _reader("bias", sign=-1 / gear)))
+    dof = {i: v for i, v in driven if source[v] == "ctrl"}
+    for name, i in layout.gains:
+        if i in dof:
+            own = library.load(name).modelled(model, [i])
+            out.append(_gain(name, title[i], layout, layout.gain(name, i), dof[i], own))
     if len(driven) > 1:
         on = np.isin(np.arange(layout.nv), [v for _, v in driven])
         out.append(scale("actuator_gain", "all", on, SURE))
     return out
+
+
+def _gain(effect: str, where: str, layout: Layout, first: int, dof: int, modelled: Mapping[str, float]) -> Term:
+    """Return a servo with another gain: what it gives less than the model is what the mechanism needs more.
+
+    Its coefficient is the gain's multiple less 1. A force limit bends the effort, which is the coefficient times the
+    secant from the model's gain, interpolated between GAINS.
+    """
+    logs, low = np.log(GAINS), library.load(effect).quantities[0].low - 1.0
+
+    def bent(c: Array) -> Array:
+        at = float(np.interp(math.log(max(1.0 + float(c[0]), GAINS[0])), logs, np.arange(len(logs))))
+        out = np.zeros((layout.nv, layout.size))
+        out[dof, first : first + len(logs)] = -c[0] * np.maximum(0.0, 1.0 - np.abs(at - np.arange(len(logs))))
+        return out
+
+    def shape(c: Array) -> Array:
+        return np.asarray((bent(c + SHIFT) - bent(c - SHIFT))[:, :, None] / (2 * SHIFT))
+
+    read: Reader = lambda c: {"factor": 1.0 + float(c[0])}  # noqa: E731
+    return Term(effect, where, shape, low=np.array([low]), read=read, bent=bent, modelled=modelled)
 
 
 def scale(effect: str, where: str, on: NDArray[np.bool_], sd: float = np.inf, rest: Array | None = None) -> Term:

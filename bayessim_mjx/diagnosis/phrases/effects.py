@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -146,7 +147,11 @@ def wrong(effect: FoundEffect) -> str:
     ((_, value),) = (quantity(k, v) for k, v in effect.parameters.items())
     neutral = kind.quantities[0].neutral
     if kind.relative:
-        return f"the {name} is {value} times the model's"
+        ((what, model),) = effect.modelled.items() or [("", math.nan)]
+        own = effect.parameters.get(what)
+        if own is None or own.bound:
+            return f"the {name} is {value} times the model's"
+        return f"the {name} is {measured(model * own.mean, model * own.sd)}, not {model:g}"
     return f"the {name} is {value}, not {neutral:g}" if neutral else f"the {name} is off by {value}"
 
 

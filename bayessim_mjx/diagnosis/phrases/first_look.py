@@ -99,7 +99,14 @@ def _mechanism(look: Look) -> str:
 
 
 def _proposal(p: Proposal) -> str:
-    each = ((k.replace("_", " "), v, p.deviations[k]) for k, v in p.parameters.items() if v)
-    numbers = ", ".join(f"{k} {measured(v, sd if sd < 1e6 else None)}" for k, v, sd in each)
+    each = ((k, v, p.deviations[k]) for k, v in p.parameters.items() if v)
+    numbers = ", ".join(_number(p.term.modelled.get(k), k, v, sd if sd < 1e6 else None) for k, v, sd in each)
     rivals = any_of(p.rivals, MOST)
     return f"first guess: {titled(p.term.effect, p.term.where)}: {numbers}{f'; or {rivals}' if rivals else ''}"
+
+
+def _number(modelled: float | None, name: str, value: float, sd: float | None) -> str:
+    """Return a number with its name; of one that multiplies the model's own, the product."""
+    if modelled is None:
+        return f"{name.replace('_', ' ')} {measured(value, sd)}"
+    return f"{measured(modelled * value, None if sd is None else modelled * sd)}, not {modelled:g}"

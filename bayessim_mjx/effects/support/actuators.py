@@ -1,6 +1,7 @@
 """Actuators of a spec by place, and what follows a command, shared by the effects on actuators."""
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -51,6 +52,21 @@ class OfGains:
     """What effects on an actuator's gains share: `factor` multiplies `columns` {field of the model: column}."""
 
     columns: ClassVar[dict[str, int]]
+
+    @classmethod
+    def modelled(cls, model: mujoco.MjModel, ids: Sequence[int]) -> dict[str, float]:
+        """Return {"factor": the gain that the model has at these actuators, in MJCF's unit}; {} where they differ."""
+        (field, k), *_ = cls.columns.items()
+        found = {abs(float(x)) for x in getattr(model, field)[list(ids), k]}
+        return {"factor": found.pop()} if len(found) == 1 else {}
+
+    @classmethod
+    def scaled(cls, model: mujoco.MjModel, i: int, factor: float) -> mujoco.MjModel:
+        """Return a copy of a model in which actuator i has another gain."""
+        out = copy.copy(model)
+        for field, k in cls.columns.items():
+            getattr(out, field)[i, k] *= factor
+        return out
 
     def on_model(self, at: Site, model: Any, theta: jax.Array) -> Any:
         factor = at.values(theta)[:, 0]
