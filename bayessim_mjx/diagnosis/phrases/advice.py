@@ -65,7 +65,7 @@ ALIKE = Verdict(
 PARTLY = Verdict(
     "Partly explained",
     "The named effects leave more of the gap than the tolerance.",
-    "Train with effects.yaml for the effects found. See below where a force is missing, and write its cause as "
+    "Train with effects.yaml for the effects found. See below where a force is missing. Write its cause as "
     "an effect of your own (--effects file.py:Name), or allow more with --tolerance.",
 )
 REMAINDER = Verdict(
