@@ -133,6 +133,9 @@ def count(n: int, thing: str) -> str:
     return f"{n} {thing}" if n == 1 else f"{n} {thing}s"
 
 
+MOST = 6  # things that a sentence lists: all joints of an arm; a rule of thumb
+
+
 def listed(names: Sequence[str], last: str = "and", most: int | None = None) -> str:
     """Join `a, b and c`; where there are more than `most`, the first and how many more: `a, b and 5 more`."""
     some, more = list(names[:most]), len(names) - len(names[:most])

@@ -13,7 +13,10 @@ from tests.test_docs import COMMANDS, FORMATS
 
 ROOT = Path(__file__).parents[1]
 MOST = 25  # words, so that a sentence is read once; plain-language guides say 15 to 25
-PAGES = ("README.md", *(f"docs/{name}.md" for name in ("index", "choosing", "first_run", "troubleshooting", "own_robot")))
+PAGES = (
+    "README.md",
+    *(f"docs/{name}.md" for name in ("index", "choosing", "first_run", "troubleshooting", "own_robot")),
+)
 REPORT = ROOT / "tests/diagnosis/phrases/sentences.txt"
 
 

@@ -12,11 +12,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from bayessim_mjx.inference import summaries
+from bayessim_mjx.inference.numbers import DEFENSIVE
 from bayessim_mjx.inference.summarizers import feature_names
 from bayessim_mjx.rl import Policy
 from bayessim_mjx.rollout import Trajectory
 
-RANDOM_SHARE = 0.1  # policy_rl_randomized: share of the steps with a uniformly random action; source: BayesSimIG
+RANDOM_SHARE = DEFENSIVE  # policy_rl_randomized: share of the steps with a uniformly random action; source: BayesSimIG
 POLICY_DEPENDENT = ("policy_rl", "policy_rl_randomized")
 
 

@@ -37,7 +37,8 @@ class Term:
         rest: `[nv, P]`, effort at these joints that it does not scale, y = rest + k (needed - rest); or None.
         sd: coefficients of the last round -> `[k]` of the priors; inf: none.
         low, high: `[k]`, allowed coefficients; within: further limits.
-        read: coefficients -> parameters of the effect; modelled: {parameter: the model's own number that it multiplies}.
+        read: coefficients -> parameters of the effect.
+        modelled: {parameter: the model's own number that it multiplies}.
     """
 
     effect: str

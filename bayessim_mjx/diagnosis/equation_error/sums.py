@@ -41,7 +41,16 @@ class Layout:
     @cached_property
     def _starts(self) -> dict[str, int]:
         kinds = {"body": rigid_body.INERTIAL * self.bodies} | dict.fromkeys(OWN, 1)
-        kinds |= {"zero": self.nv, "drive": len(self.shared), "gain": len(GAINS) * len(self.gains), "tilt": 2, "late": 1, "known": 1, "effort": 1, "end": 0}
+        kinds |= {
+            "zero": self.nv,
+            "drive": len(self.shared),
+            "gain": len(GAINS) * len(self.gains),
+            "tilt": 2,
+            "late": 1,
+            "known": 1,
+            "effort": 1,
+            "end": 0,
+        }
         return dict(zip(kinds, np.cumsum([0, *kinds.values()]).tolist(), strict=False))
 
     @property
@@ -144,6 +153,11 @@ def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Arra
     for name, column in found.own.items():
         x[:, :, layout.at(name)] = column
     x[:, :, layout.at("effort_load")] = moved.smooth(np.abs(y) * found.dry)
+    for k, (name, i) in enumerate(layout.gains):
+        dof = drives.dof_of(model, i)
+        if dof is not None and source[dof] == "ctrl":  # a measured effort is what the servo gave, whatever its gains
+            for g, more in enumerate(_by_gain(log, model, library.load(name), i, of["ctrl"][:, i]), len(GAINS) * k):
+                x[:, dof, layout.at("gain") + g] = filtered(model.actuator_gear[i, 0] * more, log, moved)
     for v, column in _zeros(model, moved).items():
         x[:, :, layout.at("zero") + v] = moved.smooth(column)
     x[:, :, layout.at("effort")], x[:, :, layout.at("late")] = y, np.gradient(y, moved.step, axis=0)
@@ -151,11 +165,6 @@ def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Arra
         dof = drives.dof_of(model, i)
         if dof is not None and source[dof] in of:
             x[:, dof, layout.drive(i)] = filtered(model.actuator_gear[i, 0] * of[source[dof]][:, i], log, moved)
-    for k, (name, i) in enumerate(layout.gains):
-        dof = drives.dof_of(model, i)
-        if dof is not None and source[dof] == "ctrl":  # a measured effort is what the servo gave, whatever its gains
-            for g, more in enumerate(_by_gain(log, model, library.load(name), i, of["ctrl"][:, i]), len(GAINS) * k):
-                x[:, dof, layout.at("gain") + g] = filtered(model.actuator_gear[i, 0] * more, log, moved)
     rows = np.stack([moved.moving(v) & (source[v] != "") for v in range(model.nv)])
     return x, rows, moved.share
 

@@ -36,11 +36,11 @@ class Size:
     """Of a proposal. Rules of thumb, not measured.
 
     Attributes:
-        seconds: of an experiment; models: that are compared; final: experiments that are looked at in full.
+        seconds: of an experiment; final: experiments that are looked at in full, and rivals that they have to tell
+            from the answer.
     """
 
     seconds: float = 10.0
-    models: int = 4
     final: int = 3
 
 
@@ -133,11 +133,11 @@ def _contenders(of: Selection, given: Sequence[Model] | None) -> tuple[list[Mode
     found = [r.model for rivals in of.rivals.values() for r in rivals if not r.contains] if given is None else given
     found = list({id(m): m for m in found if m is not of.answer}.values())
     if found:
-        return [of.answer, *found[: SIZE.models - 1]], True
+        return [of.answer, *found[: SIZE.final]], True
     own = {c.effect for c in of.answer.effects}
     losers = [m for m in ranked(of.state) if m is not of.answer and not {c.effect for c in m.effects} & own]
     close = [m for m in losers if abs(nats(m, of.answer)) < EFFORT.margin and (m.effects or own)]
-    return [of.answer, *close[: SIZE.models - 2]], False
+    return [of.answer, *close[: SIZE.final - 1]], False
 
 
 def _touched(joints: dict[str, int], models: Sequence[Model], model: Any) -> dict[str, int]:

@@ -16,9 +16,7 @@ from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing, pooled
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import Velocity, agreeing, velocities
-from bayessim_mjx.quantities import listed
-
-FEW = 3  # names that a sentence lists; wording alone, a rule of thumb
+from bayessim_mjx.quantities import MOST, listed
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +113,7 @@ class Gate:
                     logs, joints = reasons.setdefault((r.source, r.text), ({}, {}))
                     logs[report.log.name] = joints[r.joint] = None
         return tuple(
-            f"{listed([*logs], most=FEW)}: effort of {listed([*joints], most=FEW)} ({why[0]}) not compared with the "
+            f"{listed([*logs], most=MOST)}: effort of {listed([*joints], most=MOST)} ({why[0]}) not compared with the "
             f"motion: {why[1]}"
             for why, (logs, joints) in reasons.items()
         )

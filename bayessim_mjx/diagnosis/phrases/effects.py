@@ -13,7 +13,7 @@ from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.correction import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.selection.numbers import ODDS
 from bayessim_mjx.effects.support.words import words
-from bayessim_mjx.quantities import finite, listed, percent
+from bayessim_mjx.quantities import MOST, finite, listed, percent
 
 if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.selection.bounds import Bound
@@ -33,7 +33,6 @@ RECIPROCALS = {
     "slowness": "largest rate",
 }
 WRONG = "the true "  # begins the words for an effect whose number the simulator has, but not right
-MOST = 6  # things that a sentence lists: all joints of an arm; a rule of thumb
 # standard deviations, 1.98: the odds of a normal number against so large a chance deviation are strong (`Odds.strong`);
 # false reports of fitted values were not counted
 CLEAR = -float(ndtri(0.5 / (1.0 + ODDS.strong)))

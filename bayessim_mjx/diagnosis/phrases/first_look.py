@@ -7,11 +7,10 @@ from collections.abc import Sequence
 
 from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.equation_error.search import Proposal
+from bayessim_mjx.diagnosis.logcheck.drives import LEAST
 from bayessim_mjx.diagnosis.logcheck.links import Channel
-from bayessim_mjx.diagnosis.phrases.effects import MOST, any_of, measured, titled
-from bayessim_mjx.quantities import listed, percent
-
-ROUGH = 0.05  # of an effort, rms: smaller residuals are not reported; a rule of thumb
+from bayessim_mjx.diagnosis.phrases.effects import any_of, measured, titled
+from bayessim_mjx.quantities import MOST, listed, percent
 
 
 def lines(look: Look) -> list[str]:
@@ -51,14 +50,14 @@ def verdict(look: Look) -> str:
     measured_ = [j for j in look.joints if j.source == "effort"]
     if not measured_:
         return motors
-    fits = all(j.nominal < 2 * ROUGH for j in measured_)
+    fits = all(j.nominal < 2 * LEAST for j in measured_)
     ratios = [j.needs for j in measured_ if math.isfinite(j.needs)]
     mean = math.exp(sum(math.log(max(r, 1e-3)) for r in ratios) / max(len(ratios), 1))
     if fits:
         mechanism = "the mechanism moves as the model predicts"
-    elif mean > 1 + ROUGH:
+    elif mean > 1 + LEAST:
         mechanism = "the mechanism is heavier or stiffer than the model"
-    elif mean < 1 - ROUGH:
+    elif mean < 1 - LEAST:
         mechanism = "the mechanism is lighter than the model"
     else:
         mechanism = "the mechanism differs from the model"
@@ -89,10 +88,10 @@ def _mechanism(look: Look) -> str:
     only = "effort -> motion" if source == {"effort"} else "command -> motion"
     name = "effort or command -> motion" if len(source) > 1 and "effort" in source else only
     worst = sorted(look.joints, key=lambda j: -j.nominal)
-    if worst[0].nominal < ROUGH:
+    if worst[0].nominal < LEAST:
         return f"{name}: the model explains the motion of every joint to {percent(worst[0].nominal)} of the effort"
-    off = {j.name: f" (measured / model = {j.needs:.2f})" for j in worst if abs(j.needs - 1) > ROUGH}  # NaN: unknown
-    parts = [f"{j.name} {percent(j.nominal)}{off.get(j.name, '')}" for j in worst[:MOST] if j.nominal >= ROUGH]
+    off = {j.name: f" (measured / model = {j.needs:.2f})" for j in worst if abs(j.needs - 1) > LEAST}  # NaN: unknown
+    parts = [f"{j.name} {percent(j.nominal)}{off.get(j.name, '')}" for j in worst[:MOST] if j.nominal >= LEAST]
     after = max(j.left for j in look.joints)
     tail = f"; at most {percent(after)} with the guesses below" if look.proposals else ""
     return f"{name}: effort that the model does not explain (rms): {', '.join(parts)}{tail}"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from bayessim_mjx.diagnosis.phrases.effects import CLEAR, MOST
+from bayessim_mjx.diagnosis.phrases.effects import CLEAR
 from bayessim_mjx.diagnosis.request import Tolerance
-from bayessim_mjx.quantities import EXACT, extent, finite, listed
+from bayessim_mjx.quantities import EXACT, MOST, extent, finite, listed
 
 STAGES = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
 

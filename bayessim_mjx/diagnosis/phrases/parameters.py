@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bayessim_mjx.diagnosis.phrases.effects import MOST, any_of
-from bayessim_mjx.quantities import listed
+from bayessim_mjx.diagnosis.phrases.effects import any_of
+from bayessim_mjx.quantities import MOST, listed
 
 STUCK = "At a bound: {named}. They stand in for something missing, or their ranges are too narrow."
 FAR = "Far from the data sheet: {named}."

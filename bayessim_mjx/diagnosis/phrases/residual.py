@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis.phrases.effects import MOST
 from bayessim_mjx.diagnosis.result import Place
 from bayessim_mjx.diagnosis.statistics import Gap, of_one
-from bayessim_mjx.quantities import count, listed, percent
+from bayessim_mjx.quantities import MOST, count, listed, percent
 
 if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes, Flexible

@@ -9,7 +9,7 @@ from bayessim_mjx.diagnosis.phrases import effects as named
 from bayessim_mjx.diagnosis.phrases import parameters, residual
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
 from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
-from bayessim_mjx.quantities import extent, finite, listed, percent
+from bayessim_mjx.quantities import MOST, extent, finite, listed, percent
 
 HEADS = {
     "no_gap": "No gap above the noise: the logs differ from the simulator by {nominal}.",
@@ -77,7 +77,7 @@ def sentences(d: Diagnosis) -> list[str]:
     members = {label for a in d.answers for m in a["members"] for label in m["effects"]}
     hidden = [label for label in d.hidden if label not in members]  # a class already says that they are not separated
     their = "its" if len(d.effects) == 1 else "their"
-    texts += [HIDDEN.format(them=them, their=their, hidden=named.any_of(hidden, named.MOST))] if hidden else []
+    texts += [HIDDEN.format(them=them, their=their, hidden=named.any_of(hidden, MOST))] if hidden else []
     texts += _noise(d)
     if d.verdict == "unexplained" and basis.get("flexible"):
         texts += residual.flexible(basis["flexible"], far.in_sample)
@@ -259,10 +259,9 @@ def _by_joint(far: Gap, effects: bool) -> str:
     words = "without and with the effects" if effects else "before and after recalibration"
     names = _worst(far)
     rows = [
-        f"{n} {' to '.join(extent(far.physical[n][s], far.physical[n]['unit']) for s in stages)}"
-        for n in names[: named.MOST]
+        f"{n} {' to '.join(extent(far.physical[n][s], far.physical[n]['unit']) for s in stages)}" for n in names[:MOST]
     ]
-    more = f"; {len(names) - named.MOST} more in the table" if len(names) > named.MOST else ""
+    more = f"; {len(names) - MOST} more in the table" if len(names) > MOST else ""
     return f"By joint, {words}: {'; '.join(rows)}{more}."
 
 

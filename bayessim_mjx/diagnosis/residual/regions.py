@@ -19,8 +19,8 @@ from bayessim_mjx.diagnosis.selection.numbers import ODDS
 
 Array = NDArray[np.float64]
 
-# Share of the squared gap, or of a force's power, from which on a part of it is mentioned: as much as decides a verdict
-# (`summary.verdict.Limits.share`, docs/decisions/force_left.md)
+# Share of the squared gap, or of a force's power, from which on a part of it is mentioned, and decides a verdict
+# (docs/decisions/force_left.md)
 MENTIONED = 0.1
 FALSE = 1 / ODDS.strong  # rate of false discoveries
 ALONG = "force along the motion"

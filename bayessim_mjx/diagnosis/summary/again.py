@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis.experiment.propose import SIZE
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.discretisation import refined
@@ -28,10 +29,9 @@ from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.physics import Physics, staggered
 
 Array = NDArray[np.float64]
-# These three bound the seconds that whole logs take.
-LOGS = 8  # at most; a rule of thumb
-SECONDS = 10.0  # of each; a rule of thumb
-DRAWS = 8  # of the start, and as many of start and parameters; a rule of thumb
+# Whole logs at most, each as long as an experiment (`SIZE.seconds`), and draws of the start, as many again of start and
+# parameters: seconds alone; a rule of thumb
+SEVERAL = 8
 # times as many steps as the fit took: a quarter of an error of first order is left, and extrapolated (Richardson 1911)
 FINER = 4
 
@@ -71,14 +71,14 @@ def over_whole_logs(found: Findings, say: Progress) -> Findings:
 
 
 def whole_logs(found: Findings) -> Whole:
-    """Simulate every stage on at most LOGS logs; without the log's condition in the fit, where it has one."""
+    """Simulate every stage on at most SEVERAL logs; without the log's condition in the fit, where it has one."""
     setup, cut = found.setup, found.setup.fitter.simulator.windows
     stages = [s for s in found.predictions if s != "with_effects" or found.model.effects]
     logs = np.unique(cut.log)
-    logs = logs[np.unique(np.linspace(0, len(logs) - 1, min(len(logs), LOGS)).round().astype(int))]
+    logs = logs[np.unique(np.linspace(0, len(logs) - 1, min(len(logs), SEVERAL)).round().astype(int))]
     first = [int(np.flatnonzero(cut.log == r)[0]) for r in logs]
     starts = [int(cut.start[w]) for w in first]
-    length = [min(len(cut.logs[r]) - 1 - a, round(SECONDS / cut.dt)) for r, a in zip(logs, starts, strict=True)]
+    length = [min(len(cut.logs[r]) - 1 - a, round(SIZE.seconds / cut.dt)) for r, a in zip(logs, starts, strict=True)]
     chains = _chains(setup, logs, starts, max(length))
     every = _simulated(found, chains, stages, first)
     errors = [own[:, :steps] for own, steps in zip(every, length, strict=True)]
@@ -110,7 +110,7 @@ def _cut(setup: Setup, physics: Physics, starts: list[tuple[int, int]]) -> windo
 
 
 def _simulated(found: Findings, chains: windows.Windows, stages: Sequence[str], first: Sequence[int]) -> Array:
-    """Whitened errors `[L, stages + 2 DRAWS, H, channels]` of all logs; first: a window of each."""
+    """Whitened errors `[L, stages + 2 SEVERAL, H, channels]` of all logs; first: a window of each."""
     fitter = found.setup.fitter
     last = _model(found, stages[-1])
     # a right law's parameters differ by noise, and by as much as two simulators
@@ -126,7 +126,7 @@ def _simulated(found: Findings, chains: windows.Windows, stages: Sequence[str], 
 
 
 def _drawn(found: Findings, stages: Sequence[str], law: Array, w: int) -> tuple[Array, Array]:
-    """Thetas `[stages + 2 DRAWS, P]` and changes of the start state `[.., 2 nv]` of the log of window w.
+    """Thetas `[stages + 2 SEVERAL, P]` and changes of the start state `[.., 2 nv]` of the log of window w.
 
     The first draws are of the start alone, the last of start and parameters, whose covariance has the root `law`.
     """
@@ -138,10 +138,10 @@ def _drawn(found: Findings, stages: Sequence[str], law: Array, w: int) -> tuple[
     offsets = [found.predictions[s].offsets[w] for s in stages]
     B, last = models[-1].fit.B[w], models[-1]
     start = np.linalg.cholesky(np.linalg.inv(B.T @ B + np.diag(1 / fitter.spread**2)))
-    moved = offsets[-1] + rng.normal(size=(DRAWS, len(start))) @ start.T
-    off = values[-1] + rng.normal(size=(DRAWS, len(values[-1]))) @ law.T
+    moved = offsets[-1] + rng.normal(size=(SEVERAL, len(start))) @ start.T
+    off = values[-1] + rng.normal(size=(SEVERAL, len(values[-1]))) @ law.T
     ends = np.array([(c.low, c.high) for c in last.fit.coordinates]).reshape(-1, 2).T
-    each = zip([*models, *[last] * 2 * DRAWS], [*values, *[values[-1]] * DRAWS, *np.clip(off, *ends)], strict=True)
+    each = zip([*models, *[last] * 2 * SEVERAL], [*values, *[values[-1]] * SEVERAL, *np.clip(off, *ends)], strict=True)
     return np.stack([fitter.vector(m.fit.coordinates, v) for m, v in each]), np.concatenate([offsets, moved, moved])
 
 
@@ -169,10 +169,10 @@ def _judged(
     """Costs of the logs that can be predicted, each as long as it can be, and notes on the others.
 
     Args:
-        errors: `[stages + 2 DRAWS, H, channels]` of each log; seen: logs that are simulated in sample.
+        errors: `[stages + 2 SEVERAL, H, channels]` of each log; seen: logs that are simulated in sample.
     """
     cut, allowed, count = setup.fitter.simulator.windows, setup.tolerance, len(stages)
-    start, law = slice(count, count + DRAWS), slice(count + DRAWS, None)
+    start, law = slice(count, count + SEVERAL), slice(count + SEVERAL, None)
     last = [predictable(e[start] - e[count - 1], allowed) for e in errors]
     chaotic = [n for n, k, e in zip(names, last, errors, strict=True) if k < e.shape[1]]
     broken = [n for n, k, e in zip(names, last, errors, strict=True) if not np.isfinite(e[:count, :k]).all()]
@@ -190,7 +190,7 @@ def _judged(
         chance=np.array([np.mean((e[start] - e[count - 1]) ** 2) for e in long]),
         beyond=np.array([beyond(e[count - 1], e[law] - e[count - 1]) for e in long]),
         group=group[kept],
-        name="whole log" if not chaotic and longest < SECONDS - cut.dt else f"up to {longest:.2g} s",
+        name="whole log" if not chaotic and longest < SIZE.seconds - cut.dt else f"up to {longest:.2g} s",
         seconds=float(np.median([last[i] for i in kept]) * cut.dt) if kept else 0.0,
         notes=tuple(notes.whole_logs(names, chaotic, broken, longest, away, len(kept), seen)),
         in_sample=seen,

@@ -153,7 +153,7 @@ def _effect(found: Findings, effect: Candidate, sd: Array, part: dict[str, Any])
 
 
 def _modelled(physics: Physics, effect: Candidate) -> dict[str, float]:
-    """Return the model's own numbers that an effect's parameters multiply, where they are the same at all its places."""
+    """Return the model's own numbers that an effect's parameters multiply, where all its places have the same."""
     for kind, site in zip(physics.effects, physics.sites, strict=True):
         if kind.name == effect.effect and isinstance(kind, OfGains):
             here = [i for name, i in zip(site.names, site.ids, strict=True) if effect.where in (name, "all")]

@@ -14,6 +14,7 @@ from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.phrases.effects import CLEAR
 from bayessim_mjx.diagnosis.residual.disturbance import Origin, origin
+from bayessim_mjx.diagnosis.residual.regions import MENTIONED
 from bayessim_mjx.diagnosis.result import Gap
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.numbers import FLOOR, ODDS, RELEVANCE
@@ -31,7 +32,7 @@ class Limits:
             explanation. Those that leave less are, though their law may be imperfect.
     """
 
-    share: float = 0.1
+    share: float = MENTIONED
     # chance that known parameters of a robot lie together as far from their data sheet as the named effects leave them,
     # were it so many times as inaccurate as stated (or as the least accurate ones, `data_sheet.WORST`, where nobody
     # stated it): below that the effects explain the motion of another robot. In 63 simulated cases in which something

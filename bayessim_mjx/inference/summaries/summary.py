@@ -16,9 +16,10 @@ from jax import Array
 
 from bayessim_mjx.config.names import SUMMARIES
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.inference.numbers import AT_ONCE
 
 Summarizer = Callable[..., Array]  # (states [T+1, S], actions [T, A], valid [T] or nothing) -> [D]
-MAX_FEATURES = 16384  # 10 000 trajectories of as many features are 0.6 GiB; source: memory alone
+MAX_FEATURES = 16 * AT_ONCE  # 10 000 trajectories of as many features are 0.6 GiB; source: memory alone
 
 
 class Stream(NamedTuple):
