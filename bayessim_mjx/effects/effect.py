@@ -61,6 +61,7 @@ class Effect(abc.ABC):
     # of a sub-step it mixes two commands, which what is not linear has to see one by one
     last: ClassVar[bool] = False
     relative: ClassVar[bool] = False  # its number multiplies one that the model has (kp)
+    loop: ClassVar[str] = ""  # number of a controller (kp, kd) that it multiplies; on offer where logs declare one
     # whether its number is a time by which a signal of its joint is late
     late: ClassVar[bool] = False
     offered: ClassVar[bool] = True  # among all the effects that a diagnosis tries; else only where it is named
@@ -167,6 +168,10 @@ class Effect(abc.ABC):
     def on_command(self, at: Site, memory: Any, command: jax.Array, theta: jax.Array) -> tuple[Any, jax.Array]:
         """Change the command of one control step, `[substeps, nu]`: one row per sub-step (four of them by RK4)."""
         return memory, command
+
+    def on_law(self, at: Site, law: Any, theta: jax.Array) -> Any:
+        """Change the controller between command and actuators (`physics.controllers.Law`), where one is declared."""
+        return law
 
     def on_actuator(
         self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array

@@ -118,7 +118,10 @@ def forward(own: Timestep, data: mjx.Data, carry: Memory) -> tuple[mjx.Data, Mem
     data = mjx.sensor_vel(model, data) if sensors else data
     if own.drive.law is not None:
         seen = physics.encoders(own.thetas, data.qpos, data.qvel, own.drive.active)
-        data = data.replace(ctrl=own.drive.law(data.ctrl, *seen))
+        law = own.drive.law
+        for _, effect, site, theta in own.having("on_law"):
+            law = effect.on_law(site, law, theta)
+        data = data.replace(ctrl=law(data.ctrl, *seen))
     data, memory, step = _actuated(own, data, carry[0])
     data, carry = pushed(physics, own.thetas, own.drive, data, (memory, carry[1]), step)
     data = _accelerated(model, data)

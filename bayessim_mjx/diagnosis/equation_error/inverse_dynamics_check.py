@@ -27,6 +27,7 @@ from bayessim_mjx.diagnosis.fitting.robot import Robot
 from bayessim_mjx.diagnosis.logcheck import drives, gate
 from bayessim_mjx.diagnosis.logcheck.links import Channel, channels_of
 from bayessim_mjx.logs.log import Log
+from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
 UNITS = ("N m", "Nm", "N")  # of efforts, as metadata may state them: those of the model's actuators
@@ -123,7 +124,7 @@ def check(
     known = terms.known(model, sums.layout, accuracy or {}, sums.period)
     places = [log.qpos for log in summing.shortened(logs)]
     carried = data_sheet.rated(drives.carried(model, np.concatenate(places)), rating or {})
-    offered = terms.effects(model, sums.layout, sums.source, carried)
+    offered = terms.effects(model, sums.layout, sums.source, carried, controllers.of_logs(logs, model))
     stated = all(str(log.metadata.get("effort_unit", "")) in UNITS for log in logs)
     found, unit = _searched(sums, known, offered, stated)
     # the model as it is; how late efforts are logged is no fault of it

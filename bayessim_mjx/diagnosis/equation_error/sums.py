@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx import effects as library
+from bayessim_mjx.diagnosis.fitting.scales import loops_of
 from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
 from bayessim_mjx.diagnosis.logcheck.regressor import Mask, Motion, Regressor, filtered, motion
+from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.support.actuators import OfGains
 from bayessim_mjx.logs.log import Log
+from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
 OWN = ("acceleration", "speed", "dry", "drag", "position", "one", "load", "effort_load")
@@ -30,7 +32,8 @@ class Layout:
     """Where the columns stand: ten of each body, the joint's own (OWN), zeros `[nv]`, drives, tilt [2], and others.
 
     shared: actuators that drive a joint together with others; each has a column of its own effort.
-    gains: (effect, actuator) of servos' gains; each has columns of what the servo's effort gains with each of GAINS.
+    gains: (effect, actuator) of gains of servos and declared controllers; each has columns of what
+        the effort gains with each of GAINS.
     """
 
     bodies: int
@@ -122,26 +125,30 @@ def _known(model: mujoco.MjModel, i: int) -> bool:
     return fixed and affine and int(model.actuator_dyntype[i]) == int(mujoco.mjtDyn.mjDYN_NONE)
 
 
-def layout_of(model: mujoco.MjModel) -> Layout:
-    """Return the columns of a model."""
+def layout_of(model: mujoco.MjModel, logs: Sequence[Log]) -> Layout:
+    """Return the columns of a model, and of the controllers that logs declare."""
     dofs = [drives.dof_of(model, i) for i in range(model.nu)]
     shared = tuple(i for i, dof in enumerate(dofs) if dof is not None and dofs.count(dof) > 1)
-    gains = tuple((e.name, i) for e in of_gains() for i, d in enumerate(dofs) if d is not None and e.carries(model, i))
-    return Layout(len(rigid_body.moving_bodies(model)), model.nv, shared, gains)
+    loops = loops_of(model, logs)
+    gains = [
+        (kind.name, i)
+        for kind in map(library.load, library.names())
+        for i, dof in enumerate(dofs)
+        if dof is not None
+        and (loops[kind.loop][i] if kind.loop else issubclass(kind, OfGains) and kind.carries(model, i))
+    ]
+    return Layout(len(rigid_body.moving_bodies(model)), model.nv, shared, tuple(gains))
 
 
-def of_gains() -> list[type[Any]]:
-    """Return the effects of the library that multiply a servo's gain."""
-    return [kind for kind in map(library.load, library.names()) if issubclass(kind, OfGains)]
-
-
-def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Array) -> tuple[Array, Mask, float]:
+def columns(
+    log: Log, model: mujoco.MjModel, layout: Layout, source: tuple[str, ...], slow: Array
+) -> tuple[Array, Mask, float]:
     """(all columns of one log `[T, nv, size]`, rows `[nv, T]` to be used, how many independent ones a row is).
 
     Args:
         source: `[nv]`, see `sources`; slow: `[nv]`, speeds at which dry friction turns over.
     """
-    moved, layout = motion(log, model), layout_of(model)
+    moved = motion(log, model)
     found = Regressor.of(model, moved, slow)
     x = np.zeros((len(moved.time), model.nv, layout.size))
     x[:, :, : layout.at(OWN[0])] = found.columns
@@ -169,15 +176,21 @@ def columns(log: Log, model: mujoco.MjModel, source: tuple[str, ...], slow: Arra
     return x, rows, moved.share
 
 
-def _by_gain(log: Log, model: mujoco.MjModel, effect: type[Any], actuator: int, force: Array) -> Iterator[Array]:
+def _by_gain(log: Log, model: mujoco.MjModel, kind: type[Effect], actuator: int, force: Array) -> Iterator[Array]:
     """`[T]` of each of GAINS: (force with that multiple of a gain - force) / (multiple - 1); a derivative at 1.
 
     Without a force limit all are the same.
     """
+    log = drives.centred(log)
     for factor in GAINS:
         factor = factor if factor != 1.0 else 1.0 + SHIFT
-        moved = drives.commanded(drives.centred(log), effect.scaled(model, actuator, factor))[:, actuator]
-        yield (moved - force) / (factor - 1.0)
+        if issubclass(kind, OfGains):
+            moved = drives.commanded(log, kind.scaled(model, actuator, factor))
+        else:
+            law = controllers.read(log.metadata, model, log.actuators, log.name)
+            gains = getattr(law, kind.loop).at[actuator].multiply(factor)
+            moved = drives.commanded(log, model, law.replace(**{kind.loop: gains}))
+        yield (moved[:, actuator] - force) / (factor - 1.0)
 
 
 def _zeros(model: mujoco.MjModel, moved: Motion) -> dict[int, Array]:
@@ -197,12 +210,12 @@ def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
     """Return the sums of logs that move; joints whose effort is not known in all of them are left out."""
     each = [sources(log, model) for log in logs]
     source = tuple(_common(s) for s in zip(*each, strict=True))
-    layout = layout_of(model)
+    layout = layout_of(model, logs)
     short = shortened(logs)
     top = np.max([np.percentile(np.abs(log.qvel), 95, axis=0) for log in short], axis=0)
     gram, rows = np.zeros((model.nv, layout.size, layout.size)), np.zeros(model.nv)
     for log in short:
-        x, moving, share = columns(log, model, source, drives.LEAST * top + 1e-12)
+        x, moving, share = columns(log, model, layout, source, drives.LEAST * top + 1e-12)
         for v in range(model.nv):
             own = x[moving[v], v]
             gram[v] += share * own.T @ own

@@ -15,7 +15,9 @@ from bayessim_mjx.diagnosis.equation_error.fit import LEAST, Term
 from bayessim_mjx.diagnosis.equation_error.sums import GAINS, SHIFT, Layout
 from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of
+from bayessim_mjx.effects.support.actuators import OfGains
 from bayessim_mjx.effects.support.site import element_names
+from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
 Reader = Callable[[Array], Mapping[str, float]]  # coefficients -> parameters of the effect
@@ -56,11 +58,18 @@ def known(
     return [*out, _term("lateness", "all", _map(layout, layout.at("late")), sd=period)]
 
 
-def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carried: Array) -> list[Term]:
+def effects(
+    model: mujoco.MjModel,
+    layout: Layout,
+    source: Sequence[str],
+    carried: Array,
+    law: controllers.Law | None = None,
+) -> list[Term]:
     """Effects of the library that may add to, or scale, what the known parameters say; those over all joints too.
 
     Args:
         source: `[nv]`, where efforts come from; carried: `[nbody]`, kg that may be on each body.
+        law: controllers that the logs declare.
     """
     joints = [v for v in range(model.nv) if model.jnt_type[model.dof_jntid[v]] >= int(mujoco.mjtJoint.mjJNT_SLIDE)]
     driven = [
@@ -82,7 +91,7 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
         if np.any(model.jnt_type == 3):
             zero, read = _map(layout, layout.at("zero") + v), _reader("offset", sign=-1.0)
             out.append(_term("joint_offset", name, zero, read, sd=_askew("joint_offset")))
-    out += _on_actuators(model, layout, driven, source)
+    out += _on_actuators(model, layout, driven, source, law)
     tilt = np.stack([_map(layout, c) for c in (layout.at("tilt"), layout.at("tilt") + 1)], -1)
     if np.any(model.opt.gravity):
         out.append(_term("gravity_tilt", "world", tilt, _reader("roll", "pitch"), sd=_askew("gravity_tilt")))
@@ -90,7 +99,11 @@ def effects(model: mujoco.MjModel, layout: Layout, source: Sequence[str], carrie
 
 
 def _on_actuators(
-    model: mujoco.MjModel, layout: Layout, driven: Sequence[tuple[int, int]], source: Sequence[str]
+    model: mujoco.MjModel,
+    layout: Layout,
+    driven: Sequence[tuple[int, int]],
+    source: Sequence[str],
+    law: controllers.Law | None,
 ) -> list[Term]:
     out, title = [], element_names(model, "actuator")
     for i, v in driven:
@@ -102,8 +115,9 @@ def _on_actuators(
     dof = {i: v for i, v in driven if source[v] == "ctrl"}
     for name, i in layout.gains:
         if i in dof:
-            own = library.load(name).modelled(model, [i])
-            out.append(_gain(name, title[i], layout, layout.gain(name, i), dof[i], own))
+            own = library.load(name)
+            known = own.modelled(model, [i]) if issubclass(own, OfGains) else own.declared(law, [i])
+            out.append(_gain(name, title[i], layout, layout.gain(name, i), dof[i], known))
     if len(driven) > 1:
         on = np.isin(np.arange(layout.nv), [v for _, v in driven])
         out.append(scale("actuator_gain", "all", on, SURE))

@@ -150,8 +150,10 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
 
 
 def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:
-    """Joints that never moved tell nothing of what happens in them; nor do contacts of a model without contacts."""
+    """Joints that never moved, contacts that are off and controllers that nobody declared tell nothing."""
     model = scales.model
+    if kind.loop:
+        return bool(scales.loops[kind.loop][element_names(model, "actuator").index(place)])
     if kind.kind == "joint":
         joint = element_names(model, "joint").index(place)
         return bool(scales.moves[model.jnt_dofadr[joint]])

@@ -65,12 +65,13 @@ class DeclaredLaw:
         return np.where(on_position + on_velocity > 0, np.clip(loop, -limit, limit), command * scale)
 
 
-def commanded(log: Log, model: mujoco.MjModel) -> Array:
+def commanded(log: Log, model: mujoco.MjModel, law: controllers.Law | None = None) -> Array:
     """`[T, nu]`, forces that the commands ask of the actuators before the gear, through the law that the log declares.
 
     Without a declared law the commands are ctrl. Forces are those of the model: f = gain u + b0 + b1 l + b2 dl/dt.
+    law: another than the declared one.
     """
-    out = controlled(log, model)
+    out = controlled(log, model) if law is None else DeclaredLaw(law)(log.ctrl, log.qpos, log.qvel)
     for i in range(model.nu):
         dof = dof_of(model, i)
         gear, gain, bias = model.actuator_gear[i, 0], model.actuator_gainprm[i, 0], model.actuator_biasprm[i]

@@ -23,8 +23,7 @@ from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.selection import bounds, heldout
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
-from bayessim_mjx.effects.support.actuators import OfGains
-from bayessim_mjx.physics import Physics
+from bayessim_mjx.effects.support.actuators import OfGains, OfLoops
 
 Array = NDArray[np.float64]
 
@@ -147,17 +146,20 @@ def _effect(found: Findings, effect: Candidate, sd: Array, part: dict[str, Any])
         equivalent_to=[r.to_dict() | ({"weight": weight_of[id(r)]} if id(r) in weight_of else {}) for r in rivals],
         sentence=phrases.capital("; ".join(ends)) + "." * bool(ends),
         shared=shared | ({"unit": _unit(setup, effect, shared["unit"])} if shared else {}),
-        modelled=_modelled(setup.physics, effect),
+        modelled=_modelled(setup, effect),
         **part,
     )
 
 
-def _modelled(physics: Physics, effect: Candidate) -> dict[str, float]:
-    """Return the model's own numbers that an effect's parameters multiply, where all its places have the same."""
+def _modelled(setup: Setup, effect: Candidate) -> dict[str, float]:
+    """Return the numbers of model or logs that an effect's parameters multiply, where all places have the same."""
+    physics = setup.physics
     for kind, site in zip(physics.effects, physics.sites, strict=True):
+        here = [i for name, i in zip(site.names, site.ids, strict=True) if effect.where in (name, "all")]
         if kind.name == effect.effect and isinstance(kind, OfGains):
-            here = [i for name, i in zip(site.names, site.ids, strict=True) if effect.where in (name, "all")]
             return kind.modelled(physics.mj_model, here)
+        if kind.name == effect.effect and isinstance(kind, OfLoops):
+            return kind.declared(setup.fitter.simulator.windows.batch.law, here)
     return {}
 
 

@@ -57,8 +57,7 @@ class OfGains:
     def modelled(cls, model: mujoco.MjModel, ids: Sequence[int]) -> dict[str, float]:
         """Return {"factor": the gain that the model has at these actuators, in MJCF's unit}; {} where they differ."""
         (field, k), *_ = cls.columns.items()
-        found = {abs(float(x)) for x in getattr(model, field)[list(ids), k]}
-        return {"factor": found.pop()} if len(found) == 1 else {}
+        return _alike(getattr(model, field)[list(ids), k])
 
     @classmethod
     def scaled(cls, model: mujoco.MjModel, i: int, factor: float) -> mujoco.MjModel:
@@ -78,6 +77,35 @@ class OfGains:
             for field, k in self.columns.items():
                 getattr(actuator, field.removeprefix("actuator_"))[k] *= own["factor"]
         return None
+
+
+def _alike(gains: np.ndarray) -> dict[str, float]:
+    found = {abs(float(x)) for x in gains.ravel()}
+    return {"factor": found.pop()} if len(found) == 1 else {}
+
+
+class OfLoops:
+    """What effects on the gains of a declared controller share: `factor` multiplies its number `loop`."""
+
+    loop: ClassVar[str]
+
+    def on_law(self, at: Site, law: Any, theta: jax.Array) -> Any:
+        gains = getattr(law, self.loop)
+        return law.replace(**{self.loop: gains.at[at.ids].multiply(at.values(theta)[:, 0])})
+
+    @classmethod
+    def declared(cls, law: Any, ids: Sequence[int]) -> dict[str, float]:
+        """Return {"factor": the gain that logs declare at these actuators}, {} where it is not the same."""
+        return {} if law is None else _alike(np.asarray(getattr(law, cls.loop))[..., list(ids)])
+
+    @classmethod
+    def carries(cls, model: mujoco.MjModel, i: int) -> bool:
+        """Return whether the actuator drives one joint, on whose angle a controller can close its loop."""
+        return int(model.actuator_trntype[i]) <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+
+    def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
+        own = ", ".join(f"{self.loop} of {name} times {own['factor']:.4g}" for name, own in values.items())
+        return f"the controller is not the model's but the logs': {own}"
 
 
 def limits(actuator: Any) -> np.ndarray | None:

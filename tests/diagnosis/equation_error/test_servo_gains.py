@@ -32,3 +32,18 @@ def test_the_gains_of_the_model_are_not_doubted():
     xml = SERVO.format(kp=20.0, kv=0.3, most=0.5)
     seen = check([record(xml, targets, name=f"{k}.npz", seed=k) for k in range(3)], mujoco.MjModel.from_xml_string(xml))
     assert not seen.proposals
+
+
+MOTOR = SERVO[: SERVO.index("<actuator>")] + '<actuator><motor name="servo" joint="horn"/></actuator></mujoco>'
+
+
+@pytest.mark.parametrize(("kp", "kd"), [(7.0, 0.3), (20.0, 0.9)])
+def test_a_gain_that_the_logs_declare_wrongly_is_proposed(kp: float, kd: float):
+    declared = {"law": "position", "kp": 20.0, "kd": 0.3}
+    real = SERVO.format(kp=kp, kv=kd, most=9.0)
+    logs = [record(real, targets, name=f"{k}.npz", seed=k, controller=declared) for k in range(3)]
+    seen = check(logs, mujoco.MjModel.from_xml_string(MOTOR))
+    name, true, known = ("controller_stiffness", kp, 20.0) if kp != 20.0 else ("controller_damping", kd, 0.3)
+    assert seen.proposals[0].label == f"{name}@servo"
+    assert known * seen.proposals[0].parameters["factor"] == pytest.approx(true, rel=0.12)
+    assert f", not {known:g}" in " ".join(first_look.lines(seen))
