@@ -19,6 +19,7 @@ from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.equation_error import fit as fitting
 from bayessim_mjx.diagnosis.equation_error import sums as summing
 from bayessim_mjx.diagnosis.equation_error import terms
+from bayessim_mjx.diagnosis.equation_error.closed_loops import OfModel
 from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term, used
 from bayessim_mjx.diagnosis.equation_error.search import STRONG, Found, Proposal, contradicted, search
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
@@ -126,7 +127,11 @@ def check(
     carried = data_sheet.rated(drives.carried(model, np.concatenate(places)), rating or {})
     offered = terms.effects(model, sums.layout, sums.source, carried, controllers.of_logs(logs, model))
     stated = all(str(log.metadata.get("effort_unit", "")) in UNITS for log in logs)
+    own = OfModel(logs, model)
     found, unit = _searched(sums, known, offered, stated)
+    while doubtful := own.artefacts(known, found):
+        offered = [t for t in offered if t.label not in doubtful]
+        found, unit = _searched(sums, known, offered, stated)
     # the model as it is; how late efforts are logged is no fault of it
     nominal = fitting.fit(sums, [t for t in known if t.effect == "lateness"])
     channels = channels_of(logs, model, unit == 1.0)

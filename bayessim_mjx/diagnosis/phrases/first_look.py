@@ -50,7 +50,7 @@ def verdict(look: Look) -> str:
     measured_ = [j for j in look.joints if j.source == "effort"]
     if not measured_:
         return motors
-    fits = all(j.nominal < 2 * LEAST for j in measured_)
+    fits = all(j.nominal < 3 * LEAST for j in measured_)
     ratios = [j.needs for j in measured_ if math.isfinite(j.needs)]
     mean = math.exp(sum(math.log(max(r, 1e-3)) for r in ratios) / max(len(ratios), 1))
     if fits:
