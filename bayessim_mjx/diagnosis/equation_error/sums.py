@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx import effects as library
-from bayessim_mjx.diagnosis.fitting.scales import loops_of
 from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
 from bayessim_mjx.diagnosis.logcheck.regressor import Mask, Motion, Regressor, filtered, motion
 from bayessim_mjx.effects.effect import Effect
@@ -129,7 +128,7 @@ def layout_of(model: mujoco.MjModel, logs: Sequence[Log]) -> Layout:
     """Return the columns of a model, and of the controllers that logs declare."""
     dofs = [drives.dof_of(model, i) for i in range(model.nu)]
     shared = tuple(i for i, dof in enumerate(dofs) if dof is not None and dofs.count(dof) > 1)
-    loops = loops_of(model, logs)
+    loops = drives.loops_of(model, logs)
     gains = [
         (kind.name, i)
         for kind in map(library.load, library.names())

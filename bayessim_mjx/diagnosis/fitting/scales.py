@@ -16,7 +16,6 @@ from bayessim_mjx.effects.support.site import element_names
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import Parameter
-from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
 
@@ -37,7 +36,7 @@ class Scales:
     """Per dof `[nv]`: force [N m or N], speed, travel [rad or m], inertia; per actuator `[nu]`: command, effort.
 
     moves: `[nv]` bool, whether the joint moved by more than its noise at all; carried: `[nbody]`, kg that the robot can
-    hold at each body; period: s between the logs' rows; loops: see `loops_of`.
+    hold at each body; period: s between the logs' rows; loops: see `drives.loops_of`.
     """
 
     model: mujoco.MjModel
@@ -122,16 +121,8 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
         moves=ptp > 10 * noise + 1e-9,
         carried=data_sheet.rated(drives.carried(model, np.array(places)), rating or {}),
         period=float(np.median([log.period for log in logs])),
-        loops=loops_of(model, logs),
+        loops=drives.loops_of(model, logs),
     )
-
-
-def loops_of(model: mujoco.MjModel, logs: Sequence[Log]) -> dict[str, NDArray[np.bool_]]:
-    """{kp, kd: `[nu]` bool, whether a log declares a controller there that has this gain}."""
-    law = controllers.of_logs(logs, model)
-    if law is None:
-        return dict.fromkeys(("kp", "kd"), np.zeros(model.nu, bool))
-    return {gain: (np.asarray(getattr(law, gain)) > 0).any(0) for gain in ("kp", "kd")}
 
 
 def _moment(model: mujoco.MjModel) -> float:

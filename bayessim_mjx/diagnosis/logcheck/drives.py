@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -90,6 +90,14 @@ def controlled(log: Log, model: mujoco.MjModel) -> Array:
     if not controllers.declared(log.metadata):
         return log.ctrl.astype(float)
     return DeclaredLaw(controllers.read(log.metadata, model, log.actuators, log.name))(log.ctrl, log.qpos, log.qvel)
+
+
+def loops_of(model: mujoco.MjModel, logs: Sequence[Log]) -> dict[str, np.ndarray]:
+    """{kp, kd: `[nu]` bool, whether a log declares a controller there that has this gain}."""
+    law = controllers.of_logs(logs, model)
+    if law is None:
+        return dict.fromkeys(("kp", "kd"), np.zeros(model.nu, bool))
+    return {gain: (np.asarray(getattr(law, gain)) > 0).any(0) for gain in ("kp", "kd")}
 
 
 def measured(log: Log, actuator: int) -> Array | None:
