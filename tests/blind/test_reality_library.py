@@ -33,9 +33,7 @@ BASE = {"hinge.damping": 1.0, "link.mass": 1.0}
 
 
 def test_every_effect_of_the_library_can_be_hidden():
-    declared = {
-        name for name in effects.names() if effects.load(name).loop
-    }  # no robot of a check declares a controller
+    declared = {name for name in effects.names() if effects.load(name).loop}
     assert set(KNOWN) == set(effects.names()) - declared and declared
 
 
