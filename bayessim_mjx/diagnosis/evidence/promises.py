@@ -44,7 +44,7 @@ class Promises:
         self, weighing: Weighing, fit: Fit, own: NDArray[np.int64], hyper: Hyper, columns: Sequence[Column]
     ) -> None:
         self.columns = list(columns)
-        self.levels = [_level(weighing, fit, own, _scaled(hyper, f), self.columns) for f in PRIORS.sizes]
+        self.levels = [x for f in PRIORS.sizes for x in _levels(weighing, fit, own, _scaled(hyper, f), self.columns)]
         self.base = max(level.base for level in self.levels)
 
     def pairs(self, blocked: NDArray[np.bool_], count: int) -> list[Promise]:
@@ -77,6 +77,9 @@ class _Level:
     Attributes:
         S, g: `[P, P]`, `[P]`, products with each other and with the residual; precision: `[P]`, of priors.
         room: `[P, 2]`; base: evidence without columns.
+        inward: `[h, 1 + P]`, where parameters that rest at an end of their range go if that end is not held, without
+            columns and by an amount of each; sets that move one beyond its end promise nothing here. bonus: evidence
+            that the first of these steps pretends to add.
     """
 
     S: Array
@@ -84,19 +87,24 @@ class _Level:
     precision: Array
     room: Array
     base: float
+    inward: Array
+    bonus: float = 0.0
 
     def of(self, own: tuple[int, ...]) -> Promise:
         i = np.asarray(own)
         H, g, P = self.S[np.ix_(i, i)] + np.diag(self.precision[i]), self.g[i], self.precision[i]
         t = np.clip(np.linalg.lstsq(H, g, rcond=None)[0], *self.room[i].T)
-        nats = float(g @ t - 0.5 * t @ H @ t + 0.5 * np.sum(np.log(P)) - 0.5 * np.linalg.slogdet(H)[1])
+        if np.any(self.inward[:, 0] + self.inward[:, 1 + i] @ t < 0):
+            return Promise(own, -np.inf, t)
+        nats = self.bonus + float(g @ t - 0.5 * t @ H @ t + 0.5 * np.sum(np.log(P)) - 0.5 * np.linalg.slogdet(H)[1])
         return Promise(own, nats, t)
 
     def singles(self) -> Array:
         """`[P]`: of each column alone, within its bounds."""
         d = np.diag(self.S) + self.precision
         t = np.clip(self.g / d, *self.room.T)
-        return self.g * t - 0.5 * t**2 * d + 0.5 * np.log(self.precision / d)
+        found = self.bonus + self.g * t - 0.5 * t**2 * d + 0.5 * np.log(self.precision / d)
+        return np.where(np.all(self.inward[:, :1] + self.inward[:, 1:] * t >= 0, axis=0), found, -np.inf)
 
     def pairs(self) -> Array:
         """`[P, P]`: of all pairs without bounds."""
@@ -106,24 +114,44 @@ class _Level:
         logs = np.log(self.precision)
         with np.errstate(divide="ignore", invalid="ignore"):
             found = 0.5 * top / determinant - 0.5 * np.log(determinant) + 0.5 * (logs + logs[:, None])
-        return np.where(determinant > 1e-6 * np.outer(d, d), found, -np.inf)
+            first = (d * self.g[:, None] - self.S * self.g) / determinant  # amount of i in the pair (i, j)
+        good = determinant > 1e-6 * np.outer(d, d)
+        for start, *each in self.inward:
+            moved = np.array(each)[:, None] * first
+            good &= start + moved + moved.T >= 0
+        return np.where(good, self.bonus + found, -np.inf)
 
 
-def _level(weighing: Weighing, fit: Fit, own: NDArray[np.int64], hyper: Hyper, columns: Sequence[Column]) -> _Level:
-    """Return the products in some windows `own`, as if those were typical of all."""
+def _levels(
+    weighing: Weighing, fit: Fit, own: NDArray[np.int64], hyper: Hyper, columns: Sequence[Column]
+) -> list[_Level]:
+    """Return the products in some windows `own`, as if those were typical of all.
+
+    Where parameters rest at an end of their range: with them held there, and free to come back. An effect whose work
+    they do promises nothing while they are held.
+    """
     belief, k = belief_of(fit), 1 + len(fit.values)
     Q, logdet = weighing.products(fit, hyper, np.stack([c.change for c in columns], 2), own)
     share = len(fit.r) / len(own)
     Q *= share
     p = belief.best(Q[:k, :k])
-    free = np.flatnonzero((p > belief.low) & (p < belief.high))
-    H = Q[1:k, 1:k][np.ix_(free, free)] + np.diag(belief.precision[free])
-    across = Q[1:k, k:][free]
+    held = (p <= belief.low) | (p >= belief.high)
+    free = np.flatnonzero(~held)
+    H = Q[1:k, 1:k] + np.diag(belief.precision)
     amplitude = (np.log(hyper.amplitude) - np.log(PRIORS.usual)) / PRIORS.spread
-    base = belief.cost(Q[:k, :k], p) + share * logdet + float(np.sum(amplitude**2)) + float(np.linalg.slogdet(H)[1])
-    g, S = Q[0, k:] - p @ Q[1:k, k:], Q[k:, k:] - across.T @ np.linalg.solve(H, across)
-    precision = np.maximum([c.precision for c in columns], 1e-12)
-    return _Level(S, g, precision, np.array([c.room for c in columns]), -0.5 * base)
+    base = belief.cost(Q[:k, :k], p) + share * logdet + float(np.sum(amplitude**2))
+    base = -0.5 * (base + float(np.linalg.slogdet(H[np.ix_(free, free)])[1]))
+    g, S, across = Q[0, k:] - p @ Q[1:k, k:], Q[k:, k:], Q[1:k, k:]
+    believed = np.maximum([c.precision for c in columns], 1e-12), np.array([c.room for c in columns])
+    own_free = across[free].T @ np.linalg.solve(H[np.ix_(free, free)], across[free])
+    out = [_Level(S - own_free, g, *believed, base, np.zeros((0, 1 + len(g))))]
+    if held.any():
+        pull = Q[1:k, 0] - Q[1:k, 1:k] @ p + belief.precision * (belief.mean - p)
+        step, moved = np.linalg.solve(H, pull), np.linalg.solve(H, across)
+        sign = np.where(p <= belief.low, 1.0, -1.0)[held, None]
+        inward = sign * np.column_stack([step[held], -moved[held]])
+        out.append(_Level(S - across.T @ moved, g - across.T @ step, *believed, base, inward, 0.5 * float(pull @ step)))
+    return out
 
 
 def leading(
@@ -132,7 +160,8 @@ def leading(
     """Return the columns that promise most by themselves, so many of each candidate (`Effort.points`)."""
     hyper, count, nats = _scaled(hyper, PRIORS.sizes[1]), Counter[str](), list[float]()
     for first in range(0, len(columns), EFFORT.windows):  # some at a time: products of all are large
-        nats += _level(weighing, fit, own, hyper, columns[first : first + EFFORT.windows]).singles().tolist()
+        some = _levels(weighing, fit, own, hyper, columns[first : first + EFFORT.windows])
+        nats += np.max([level.singles() for level in some], axis=0).tolist()
     out = []
     for j in np.argsort(-np.array(nats)):
         count[columns[j].candidate.label] += 1
