@@ -136,17 +136,35 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
     for kind in kinds:
         found = tuple(p for p in places(kind, scales.model) if _alive(kind, p, scales))
         if not found:
-            left_out.append(f"{kind.name}: no {kind.kind} here that could carry it and was excited")
+            text = f"{kind.name}: no {kind.kind} here that could carry it and was excited"
+            left_out += [] if kind.floats else [text]
             continue
         try:
-            parameters = tuple(p for place in found for p in ranges(kind, place, scales))
-            effect = kind(where=found, parameters=parameters)
+            fitting = _with_ranges(kind, found, scales)
+            effect = kind(where=tuple(fitting), parameters=tuple(p for own in fitting.values() for p in own))
             effect.bind(scales.model, float(scales.model.opt.timestep), 1)
         except UserError as error:
             left_out.append(f"{kind.name}: {error}")
             continue
         made.append(effect)
     return tuple(made), left_out
+
+
+def _with_ranges(kind: type[Effect], found: Sequence[str], scales: Scales) -> dict[str, tuple[Parameter, ...]]:
+    """{place: parameters}, where the place has what their ranges grow with: a rotor at a site has no travel.
+
+    Raises:
+        UserError: no place has.
+    """
+    out, whys = {}, []
+    for place in found:
+        try:
+            out[place] = ranges(kind, place, scales)
+        except UserError as error:
+            whys.append(error)
+    if not out:
+        raise whys[0]
+    return out
 
 
 def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:

@@ -7,7 +7,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from bayessim_mjx.effects.support.quantity import Quantity
 from bayessim_mjx.effects.support.site import Site, find
+from bayessim_mjx.effects.support.substep import SubStep
+from bayessim_mjx.effects.support.transmission import inverse
 from bayessim_mjx.parameters import attributes
 
 if TYPE_CHECKING:
@@ -16,6 +19,15 @@ if TYPE_CHECKING:
     from mujoco import mjx
 
     from bayessim_mjx.effects.effect import Effect
+
+TINY = 1e-12  # m^2/s^2, of a speed of 0
+ROUNDS = 2  # of finding the speed half-way; the first begins at that of the start
+# numbers of the drag of a floating body; ranges without knowledge of the robot: those of a small drone
+DRAG = (
+    Quantity("linear", 0.0, 0.0, 5.0, unit="N s/m", per="force/speed", reach=(0.0, 2.0), grid=(0.01, 0.05, 0.3)),
+    Quantity("quadratic", 0.0, 0.0, 5.0, unit="N s^2/m^2", per="force/speed^2", reach=(0.0, 2.0), grid=(0.01, 0.1)),
+    Quantity("turning", 0.0, 0.0, 0.5, unit="N m s/rad", per="moment/rate", reach=(0.0, 2.0), grid=(0.05,)),
+)
 
 
 def moved(model: mujoco.MjModel) -> np.ndarray:
@@ -36,6 +48,42 @@ def project(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray, force: jax
     """Generalised force `[nv]` of forces `[n, 3]` (N, world) at the bodies' centres of mass."""
     wrench = jnp.concatenate([jnp.cross(_arm(model, data, ids), force), force], axis=1)
     return jnp.sum(data.cdof * (moved(model)[ids].T @ wrench), axis=1)  # sum_b J_b^T f_b
+
+
+def resisted(at: Site, step: SubStep, drag: jax.Array, medium: jax.Array) -> jax.Array:
+    """Generalised force `[nv]` of drag at the site's bodies, each in a tree of its own, half-way through the sub-step.
+
+    (1 + dt K A / 2) f = -K (velocity with all other forces, half-way), A = J M^-1 J^T, K = diag(r, r, r, q, q, q),
+    q = k + c |velocity half-way|: second order in dt where speeds lie half a sub-step before positions.
+
+    Args:
+        drag: `[n, 3]` (k, c, r) of DRAG, >= 0; medium: `[n, 3]` or `[3]`, its velocity in the world, m/s.
+    """
+    jacobian = _jacobian(at.mj_model, step.data, at.ids)
+    still = jnp.concatenate([jnp.zeros((len(at), 3)), jnp.broadcast_to(medium, (len(at), 3))], axis=1)
+    now = jnp.sum(jacobian * step.qvel, axis=-1) - still
+    half, unit = 0.5 * step.dt, jnp.eye(6)
+    later = now + half * jnp.sum(jacobian * jnp.sum(step.inverse * step.force, axis=-1), axis=-1)
+    out = jnp.zeros(at.nv)
+    for i in range(len(at)):
+        along, quadratic, turning = drag[i]
+        mobility, middle, force = jnp.matmul(jnp.matmul(jacobian[i], step.inverse), jacobian[i].T), now[i], now[i]
+        for _ in range(ROUNDS):
+            square = jnp.sum(middle[3:] ** 2)
+            speed = jnp.sqrt(jnp.where(square > 0, square, TINY))  # where: the root has no slope at 0
+            own = jnp.stack([turning, along + quadratic * speed])[np.repeat([0, 1], 3)]
+            force = -jnp.matmul(inverse(unit + half * own[:, None] * mobility), own * later[i])
+            middle = later[i] + half * jnp.matmul(mobility, force)
+        out = out + jnp.sum(jacobian[i] * force[:, None], axis=0)
+    return out
+
+
+def _jacobian(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray) -> jax.Array:
+    """`[n, 6, nv]`, angular velocity and that of the centre of mass in the world, of the bodies, by qvel."""
+    turn, move = jnp.split(data.cdof, 2, axis=1)
+    move = move + jnp.cross(turn, _arm(model, data, ids)[:, None])  # [n, nv, 3]
+    both = jnp.concatenate([jnp.broadcast_to(turn, move.shape), move], axis=-1)
+    return jnp.swapaxes(both * moved(model)[ids][:, :, None], 1, 2)
 
 
 def _arm(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray) -> jax.Array:
