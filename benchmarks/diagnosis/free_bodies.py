@@ -18,7 +18,7 @@ import numpy as np
 
 FINER = 10  # steps of the reality in one of the model's
 # Of a motion capture system and an inertial unit (data sheets of Vicon and of MEMS gyroscopes): m, rad, m/s, rad/s
-NOISE = {"place": 5e-4, "turn": 1e-3, "speed": 5e-3, "rate": 5e-3, "wheel": 5e-4, "wheel_rate": 5e-3}
+NOISE = {"place": 5e-4, "turn": 1e-3, "speed": 5e-3, "rate": 5e-3, "wheel": 1e-3, "wheel_rate": 5e-3}
 SPREAD = 0.03  # standard deviation of the truth's masses about the model's, a share
 
 DRONE = """<mujoco model="drone">
@@ -79,7 +79,7 @@ _WHEEL = """
         <geom name="{side}_tyre" type="ellipsoid" size=".06 .01 .06" mass=".3" friction=".8 .005 .0001"/>
       </body>"""
 WHEELED = f"""<mujoco model="wheeled">
-  <option timestep="0.004" integrator="implicitfast"/>
+  <option timestep="0.002" integrator="implicitfast" cone="elliptic"/>
   <default><geom condim="3" solref=".02 1"/></default>
   <worldbody>
     <geom name="floor" type="plane" size="10 10 .1" friction=".2 .005 .0001"/>

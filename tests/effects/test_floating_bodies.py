@@ -20,9 +20,10 @@ MASS, WEIGHT = 0.8, 0.8 * 9.81
 WORLD = physics(XML, [make("wind", where="drone")])
 START = np.array([0, 0, 0, 1, 0, 0, 0, 0.0])
 T = 150
+IDLE = np.zeros((T, 2))
 
 
-def flown(theta, command=np.zeros((T, 2)), qvel=(0,) * 7):
+def flown(theta, command=IDLE, qvel=(0,) * 7):
     """Poses and the hinge's angle `[T + 1, 8]` under (k, c, r, wind)."""
     return moved(WORLD, [theta], command, START, qvel)[0]
 
@@ -103,10 +104,10 @@ def test_tumbling_under_thrust_it_moves_as_in_mujoco():
 def test_still_air_is_wind_at_no_speed_and_neutral_changes_no_bit():
     drag = physics(XML, [make("body_drag", where="drone")])
     spin = (1, -2, 0, 0.5, 1.0, -2.0, 0)
-    (one,) = moved(drag, [[0.4, 0.2, 0.01]], np.zeros((T, 2)), START, spin)
+    (one,) = moved(drag, [[0.4, 0.2, 0.01]], IDLE, START, spin)
     np.testing.assert_array_equal(flown([0.4, 0.2, 0.01, 0, 0, 0], qvel=spin), one)
-    (off,) = moved(drag, [[0.0] * 3], np.zeros((T, 2)), START, spin)
-    bare = moved(physics(XML, []), [[]], np.zeros((T, 2)), START, spin)[0]
+    (off,) = moved(drag, [[0.0] * 3], IDLE, START, spin)
+    bare = moved(physics(XML, []), [[]], IDLE, START, spin)[0]
     np.testing.assert_array_equal(off, bare)
 
 

@@ -13,7 +13,8 @@ DRONE = """<mujoco><option timestep="0.005"/><worldbody><body name="drone" pos="
 <actuator><motor name="left" site="left" gear="0 0 1 0 0 .02"/>
 <motor name="right" site="right" gear="0 0 1 0 0 -.02"/>{motor}</actuator></mujoco>"""
 ALONE = DRONE.format(more="", motor="")
-ARM = '<body name="arm"><joint name="hinge" axis="0 1 0"/><geom size=".1" pos=".2 0 0" contype="0" conaffinity="0"/></body>'
+ARM = """<body name="arm"><joint name="hinge" axis="0 1 0"/>
+<geom size=".1" pos=".2 0 0" contype="0" conaffinity="0"/></body>"""
 BESIDE = DRONE.format(more=ARM, motor='<motor name="motor" joint="hinge"/>')
 
 
