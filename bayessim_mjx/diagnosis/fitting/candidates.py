@@ -132,39 +132,27 @@ def kinds_of(effects: str | Sequence[str | type[Effect]]) -> list[type[Effect]]:
 
 def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, ...], list[str]]:
     """One Effect per kind over all of its places, each with values and ranges of its own; and what is left out."""
-    made, left_out = [], []
+    made, without = [], dict[str, list[str]]()
     for kind in kinds:
         found = tuple(p for p in places(kind, scales.model) if _alive(kind, p, scales))
-        if not found:
-            text = f"{kind.name}: no {kind.kind} here that could carry it and was excited"
-            left_out += [] if kind.floats else [text]
-            continue
-        try:
-            fitting = _with_ranges(kind, found, scales)
-            effect = kind(where=tuple(fitting), parameters=tuple(p for own in fitting.values() for p in own))
-            effect.bind(scales.model, float(scales.model.opt.timestep), 1)
-        except UserError as error:
-            left_out.append(f"{kind.name}: {error}")
-            continue
-        made.append(effect)
-    return tuple(made), left_out
-
-
-def _with_ranges(kind: type[Effect], found: Sequence[str], scales: Scales) -> dict[str, tuple[Parameter, ...]]:
-    """{place: parameters}, where the place has what their ranges grow with: a rotor at a site has no travel.
-
-    Raises:
-        UserError: no place has.
-    """
-    out, whys = {}, []
-    for place in found:
-        try:
-            out[place] = ranges(kind, place, scales)
-        except UserError as error:
-            whys.append(error)
-    if not out:
-        raise whys[0]
-    return out
+        own, whys = dict[str, tuple[Parameter, ...]](), list[str]()
+        for place in found:
+            try:
+                own[place] = ranges(kind, place, scales)
+            except UserError as error:  # a rotor at a site has no travel
+                whys.append(str(error))
+        if found and own:
+            try:
+                effect = kind(where=tuple(own), parameters=tuple(p for each in own.values() for p in each))
+                effect.bind(scales.model, float(scales.model.opt.timestep), 1)
+                made.append(effect)
+                continue
+            except UserError as error:
+                whys.append(str(error))
+        why = whys[0] if found else f"no {kind.kind} here that could carry it and was excited"
+        if found or not kind.floats:
+            without.setdefault(why, []).append(kind.name)
+    return tuple(made), [f"{', '.join(names)}: {why}" for why, names in without.items()]
 
 
 def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:

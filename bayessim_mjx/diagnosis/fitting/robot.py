@@ -16,10 +16,10 @@ from bayessim_mjx.config import foreign
 from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.fitting.simulable import check, contacts, label, one_line, unreached
 from bayessim_mjx.effects.effect import Effect
-from bayessim_mjx.effects.support.site import floating
+from bayessim_mjx.effects.support.bodies import whole_inertia
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
-from bayessim_mjx.parameters import ParameterSpace, editing, elements
+from bayessim_mjx.parameters import ParameterSpace, elements
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.native import moved_to_joints
 
@@ -36,7 +36,6 @@ RUBS = (0.2, 1.2)
 # Iterations of Newton's solver and of its line search. Dry friction alone is solved to single precision by 4 and 6.
 # Measured with six joints, half a second: the same to 1e-7 rad as by 100 and 50, at half the time.
 ROUNDS = 8
-ASIDE = 1e-3  # m, an offset that MuJoCo's compiler does not take for 0 (1e-6, measured); it is taken back
 _IMPLICIT = int(mujoco.mjtIntegrator.mjINT_IMPLICIT)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
@@ -166,27 +165,9 @@ def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path
         warnings.warn(text, stacklevel=3)
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     moved_to_joints(spec)
-    model = _whole_inertia(spec, _by_mujoco("compile", source, spec.compile))
+    model = whole_inertia(spec, _by_mujoco("compile", source, spec.compile))
     check(model, source)
     return Robot(model, spec.copy, None, _space(model, parameters), name)._from_data_sheet(parameters is None)
-
-
-def _whole_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return the same model, whose floating bodies' centres of mass may move.
-
-    MuJoCo keeps the mass matrix of one at the origin of its body's frame as a diagonal, without room for more.
-    """
-    fixed = [b for b in range(model.nbody) if floating(model, b) and model.body_simple[b]]
-    if not fixed:
-        return model
-    other = spec.copy()
-    for body in (other.bodies[b] for b in fixed):
-        editing.explicit(other, body)
-        body.ipos = np.array(body.ipos) + [ASIDE, 0, 0]
-    new = other.compile()
-    new.body_ipos[fixed] = model.body_ipos[fixed]
-    mujoco.mj_setConst(new, mujoco.MjData(new))
-    return new
 
 
 def _by_mujoco(does: str, source: str, call: Callable[[], Any]) -> Any:

@@ -94,17 +94,25 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
     speed = _large([log.qvel for log in logs])
     ptp = np.max([_span(model, log) for log in logs], axis=0)
     data = mujoco.MjData(model)
-    torque, inertia, places = [], [], []
+    torque, driven, inertia, places = [], [], [], []
+    floats = np.flatnonzero(model.jnt_type[model.dof_jntid] == int(mujoco.mjtJoint.mjJNT_FREE))
     for log in logs:
+        ctrl = drives.controlled(log, model) if len(floats) else log.ctrl
         acceleration = np.gradient(log.qvel, log.time, axis=0)
         for k in range(0, len(log), max(1, len(log) // 100)):
             places.append(log.qpos[k])
             data.qpos[:], data.qvel[:], data.qacc[:] = log.qpos[k], log.qvel[k], acceleration[k]
             mujoco.mj_inverse(model, data)
             torque.append(np.abs(data.qfrc_inverse))
+            if len(floats):
+                data.ctrl[:] = ctrl[k]
+                mujoco.mj_fwdActuation(model, data)
+                driven.append(np.abs(data.qfrc_actuator))
             inertia.append(np.diag(mass_matrix(model, data)))
     command = _large([log.ctrl for log in logs])
-    force = np.maximum(np.percentile(torque, LIMITS.large, axis=0), _driven(model, logs))
+    force = np.percentile(torque, LIMITS.large, axis=0)
+    if len(floats):  # a body that drag holds at a steady speed needs no force by a model without drag
+        force[floats] = np.maximum(force[floats], np.percentile(driven, LIMITS.large, axis=0)[floats])
     effort = np.zeros(model.nu)
     for i in range(model.nu):
         gear = float(model.actuator_gear[i, 0]) or 1.0
@@ -127,26 +135,6 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
         carried=data_sheet.rated(drives.carried(model, np.array(places)), rating or {}),
         period=float(np.median([log.period for log in logs])),
     )
-
-
-def _driven(model: mujoco.MjModel, logs: Sequence[Log]) -> Array:
-    """Largest generalised force of the actuators on free joints `[nv]`; 0 elsewhere.
-
-    A body that drag holds at a steady speed needs none by the inverse dynamics of a model without drag.
-    """
-    out = np.zeros(model.nv)
-    free = [int(model.body_dofadr[b]) + k for b in range(model.nbody) if floating(model, b) for k in range(6)]
-    if not free:
-        return out
-    data, found = mujoco.MjData(model), []
-    for log in logs:
-        ctrl = drives.controlled(log, model)
-        for k in range(0, len(log), max(1, len(log) // 100)):
-            data.qpos[:], data.qvel[:], data.ctrl[:] = log.qpos[k], log.qvel[k], ctrl[k]
-            mujoco.mj_forward(model, data)
-            found.append(np.abs(data.qfrc_actuator[free]))
-    out[free] = np.percentile(found, LIMITS.large, axis=0)
-    return out
 
 
 def _moment(model: mujoco.MjModel) -> float:

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.support.quantity import Quantity
-from bayessim_mjx.effects.support.site import Site, find
+from bayessim_mjx.effects.support.site import Site, find, floating
 from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.effects.support.transmission import inverse
-from bayessim_mjx.parameters import attributes
+from bayessim_mjx.parameters import attributes, editing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from bayessim_mjx.effects.effect import Effect
 
 TINY = 1e-12  # m^2/s^2, of a speed of 0
+ASIDE = 1e-3  # m, an offset that MuJoCo's compiler does not take for 0 (1e-6, measured); it is taken back
 ROUNDS = 2  # of finding the speed half-way; the first begins at that of the start
 # numbers of the drag of a floating body; ranges without knowledge of the robot: those of a small drone
 DRAG = (
@@ -101,6 +102,24 @@ def inertial_site(effect: "Effect", model: mujoco.MjModel, timestep: float, subs
         if model.body_dofnum[body] > 1 and int(model.body_simple[body]) == 1:
             attributes.refuse_simple(model, int(body), f"{name}.{effect.name}")
     return at
+
+
+def whole_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a specification's model with the same numbers, whose floating bodies' centres of mass may move.
+
+    MuJoCo keeps the mass matrix of one at the origin of its body's frame as a diagonal, without room for more.
+    """
+    diagonal = [b for b in range(model.nbody) if floating(model, b) and model.body_simple[b]]
+    if not diagonal:
+        return model
+    other = spec.copy()
+    for body in (other.bodies[b] for b in diagonal):
+        editing.explicit(other, body)
+        body.ipos = np.array(body.ipos) + [ASIDE, 0, 0]
+    new = other.compile()
+    new.body_ipos[diagonal] = model.body_ipos[diagonal]
+    mujoco.mj_setConst(new, mujoco.MjData(new))
+    return new
 
 
 def with_inertials(model: "mjx.Model", ids: np.ndarray, new: "dict[str, jax.Array]") -> "mjx.Model":
