@@ -151,8 +151,7 @@ def _velocity(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
     """m/s, of the first moving body's centre of mass, in the world."""
     out = np.zeros(6)
     mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, 1, out, 0)
-    frame = data.xipos[1] - data.xpos[1]
-    return out[3:] + np.cross(out[:3], frame)
+    return out[3:]
 
 
 @dataclasses.dataclass(frozen=True)

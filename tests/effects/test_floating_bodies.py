@@ -1,10 +1,13 @@
 """Drag and wind of floating bodies against closed forms and MuJoCo C; where they are on offer."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
 
 from bayessim_mjx.effects import make
+from bayessim_mjx.effects.support.bodies import resisted
 from bayessim_mjx.effects.support.site import places
 from bayessim_mjx.errors import UserError
 from tests.effects.truths import CONTROL, moved, physics, truth
@@ -35,6 +38,40 @@ AT_REST = (0, 0, 9.81 * 0.002, 0, 0, 0, 0)
 def speeds(q):
     """Of the body's origin, amid the control steps `[T, 3]`, m/s."""
     return np.diff(q[:, :3], axis=0) / CONTROL
+
+
+def resistance(qvel, drag, medium, dt=1e-6, quat=(1, 0, 0, 0)):
+    """Generalised force `[7]` of one sub-step, and the model and data of MuJoCo C that it is computed from."""
+    model = mujoco.MjModel.from_xml_string(XML)
+    data = mujoco.MjData(model)
+    data.qpos[3:7], data.qvel[:] = quat, qvel
+    mujoco.mj_forward(model, data)
+    inverse = np.zeros((model.nv, model.nv))
+    mujoco.mj_solveM(model, data, inverse, np.eye(model.nv))
+    at = make("wind", where="drone").bind(model, 0.004, 1)
+    force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+    step = SimpleNamespace(data=data, qvel=data.qvel, inverse=inverse, force=force, dt=dt)
+    return np.asarray(resisted(at, step, np.float32([drag]), np.float32([medium]))), model, data
+
+
+def test_at_its_final_speed_drag_carries_the_weight_whatever_the_timestep():
+    for drag, speed in (([4.0, 0, 0], WEIGHT / 4), ([0, 2.0, 0], np.sqrt(WEIGHT / 2))):
+        force, *_ = resistance([0, 0, -speed, 0, 0, 0, 0], drag, [0, 0, 0], dt=0.02)
+        np.testing.assert_allclose(force[:3], [0, 0, WEIGHT], atol=1e-4)
+
+
+def test_drag_acts_at_the_centre_of_mass_along_the_air_that_comes_by():
+    """As MuJoCo projects the same force and moment, of a body that is turned and turns."""
+    quat, wind, qvel = np.array([0.8, 0.2, -0.4, 0.4]), np.array([3.0, 1.0, 0.5]), [1, 2, -1, 3, -2, 1, 0.7]
+    force, model, data = resistance(qvel, [0.3, 0.2, 0.01], wind, quat=quat)
+    v = np.zeros(6)
+    mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, 1, v, 0)
+    by = v[3:] - wind  # of the centre of mass
+    expected = np.zeros(model.nv)
+    push = -(0.3 + 0.2 * np.linalg.norm(by)) * by
+    mujoco.mj_applyFT(model, data, push, -0.01 * v[:3], data.xipos[1], 1, expected)
+    np.testing.assert_allclose(force, expected, atol=2e-5)
+    assert np.abs(expected[:6]).min() > 1e-3
 
 
 @pytest.mark.slow
@@ -86,7 +123,7 @@ def test_tumbling_under_thrust_it_moves_as_in_mujoco():
     def push(model, data):
         out = np.zeros(6)
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, 1, out, 0)
-        turn, v = out[:3], out[3:] + np.cross(out[:3], data.xipos[1] - data.xpos[1]) - wind
+        turn, v = out[:3], out[3:] - wind
         data.xfrc_applied[1] = [*(-(k + c * np.linalg.norm(v)) * v), *(-r * turn)]
 
     model = mujoco.MjModel.from_xml_string(FINE)
@@ -96,7 +133,7 @@ def test_tumbling_under_thrust_it_moves_as_in_mujoco():
     far = np.abs(real - bare)[:, :7].max(0)
     assert (far[:3] > 1).all() and far[3:].max() > 0.5
     off, own = np.abs(q - real)[:, :7].max(0), np.abs(flown([0] * 6, command, spin) - bare)[:, :7].max(0)
-    assert (off < own + 2e-3 * np.array([*far[:3], *[far[3:].max()] * 4])).all(), (off, own, far)
+    assert (off < own + 1e-3 * np.array([*far[:3], *[far[3:].max()] * 4])).all(), (off, own, far)
 
 
 @pytest.mark.slow
