@@ -46,6 +46,8 @@ AMOUNTS: dict[str, Amount] = {
     "asymmetric_friction": Amount("larger level", "F", _either("level_forward", "level_backward")),
     "viscous_friction": Amount("damping", "F s/q", _take("damping")),
     "quadratic_drag": Amount("coefficient", "F s²/q²", _take("coefficient")),
+    "body_drag": Amount("linear coefficient", "N s/m", _take("linear")),
+    "wind": Amount("linear coefficient", "N s/m", _take("linear")),
     "armature": Amount("inertia", "I", _take("inertia")),
     "joint_spring": Amount("stiffness", "F/q", _either("stiffness", "cubic")),
     "cable_tension": Amount("stiffness", "F/q", _either("forward", "backward")),
