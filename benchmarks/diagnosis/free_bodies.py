@@ -302,8 +302,8 @@ def _measured(model: mujoco.MjModel, qpos: Array, qvel: Array, rng: np.random.Ge
     return shown, qvel + speed * rng.standard_normal(model.nv)
 
 
-def write(name: str, case: str, out: str | Path, seed: int = 0) -> dict:
-    """Write a case: model.xml, logs/ and truth.json; returns the truth."""
+def write(name: str, case: str, out: str | Path, seed: int = 0, speeds: bool = True) -> dict:
+    """Write a case: model.xml, logs/ (without velocities if not `speeds`) and truth.json; returns the truth."""
     robot, out = ROBOTS[name], Path(out)
     causes = robot.cases[case]()
     model = mujoco.MjModel.from_xml_string(robot.xml)
@@ -311,11 +311,13 @@ def write(name: str, case: str, out: str | Path, seed: int = 0) -> dict:
     many = lambda kind, less: [  # noqa: E731
         f"{kind}:{j}" + (f"[{k}]" if w > 1 else "") for j, w in joints for k in range(w - (less if w > 1 else 0))
     ]
-    header = ["time", *(f"ctrl:{model.actuator(i).name}" for i in range(model.nu)), *many("qpos", 0), *many("qvel", 1)]
+    header = ["time", *(f"ctrl:{model.actuator(i).name}" for i in range(model.nu)), *many("qpos", 0)]
+    header += many("qvel", 1) if speeds else []
     (out / "logs").mkdir(parents=True, exist_ok=True)
     (out / "model.xml").write_text(robot.xml)
     for run, table in enumerate(record(robot, causes, seed)):
-        rows = np.concatenate([table["time"][:, None], table["ctrl"], table["qpos"], table["qvel"]], 1)
+        columns = [table["time"][:, None], table["ctrl"], table["qpos"]]
+        rows = np.concatenate([*columns, table["qvel"]] if speeds else columns, 1)
         path = out / "logs" / f"run{run}.csv"
         np.savetxt(path, rows, fmt="%.9g", delimiter=",", header=",".join(header), comments="")
     truth = {"robot": name, "case": case, "seed": seed, "effects": [cause.truth for cause in causes]}
@@ -329,5 +331,6 @@ if __name__ == "__main__":
     parser.add_argument("case")
     parser.add_argument("out")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--pose", action="store_true", help="log no velocities, as motion capture does")
     asked = parser.parse_args()
-    print(write(asked.robot, asked.case, asked.out, asked.seed))
+    print(write(asked.robot, asked.case, asked.out, asked.seed, not asked.pose))

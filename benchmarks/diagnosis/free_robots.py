@@ -61,7 +61,7 @@ _WHEEL = """
         <geom name="{side}_tyre" type="ellipsoid" size=".06 .01 .06" mass=".3" friction=".8 .005 .0001"/>
       </body>"""
 WHEELED = f"""<mujoco model="wheeled">
-  <option timestep="0.002" integrator="implicitfast" cone="elliptic"/>
+  <option timestep="0.0025" integrator="implicitfast" iterations="6" ls_iterations="6"/>
   <default><geom condim="3" solref=".02 1"/></default>
   <worldbody>
     <geom name="floor" type="plane" size="10 10 .1" friction=".2 .005 .0001"/>
