@@ -47,6 +47,7 @@ AMOUNTS: dict[str, Amount] = {
     "viscous_friction": Amount("damping", "F s/q", _take("damping")),
     "quadratic_drag": Amount("coefficient", "F s²/q²", _take("coefficient")),
     "body_drag": Amount("linear coefficient", "N s/m", _take("linear")),
+    "directional_drag": Amount("linear coefficient", "N s/m", _take("linear")),
     "wind": Amount("linear coefficient", "N s/m", _take("linear")),
     "armature": Amount("inertia", "I", _take("inertia")),
     "joint_spring": Amount("stiffness", "F/q", _either("stiffness", "cubic")),

@@ -55,6 +55,17 @@ def drag(where: str, linear: float = 0.0, quadratic: float = 0.0, wind: tuple = 
     return Cause(("body_drag", where, numbers), push=push)
 
 
+def uneven(where: str, linear: float, side: float, up: float) -> Cause:
+    """Drag that differs by the body's axes."""
+
+    def push(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+        frame = data.xmat[1].reshape(3, 3)
+        along = linear * np.array([1, side, up]) * (frame.T @ _velocity(model, data))
+        return np.concatenate([-frame @ along, np.zeros(3)])
+
+    return Cause(("directional_drag", where, {"linear": linear, "side": side, "up": up}), push=push)
+
+
 def steady(where: str, force: tuple[float, float, float]) -> Cause:
     """Push with a constant force (N, world)."""
     numbers = dict(zip(("force_x", "force_y", "force_z"), force, strict=True))
@@ -182,6 +193,8 @@ ROBOTS = {
             "drag_strong": lambda: [drag("drone", linear=0.4)],
             "square_weak": lambda: [drag("drone", quadratic=0.05)],
             "square_strong": lambda: [drag("drone", quadratic=0.25)],
+            "uneven_weak": lambda: [uneven("drone", 0.1, 1.0, 3.0)],
+            "uneven_strong": lambda: [uneven("drone", 0.3, 0.5, 2.0)],
             "wind_weak": lambda: [drag("drone", linear=0.25, wind=(1.5, -1.0, 0.0))],
             "wind_strong": lambda: [drag("drone", linear=0.4, wind=(4.0, 2.0, 0.0))],
             "force": lambda: [steady("drone", (0.3, -0.2, 0.0))],
@@ -201,6 +214,7 @@ ROBOTS = {
             "drag_strong": lambda: [drag("hull", linear=20.0)],
             "square_weak": lambda: [drag("hull", quadratic=10.0)],
             "square_strong": lambda: [drag("hull", quadratic=40.0)],
+            "uneven_strong": lambda: [uneven("hull", 10.0, 2.0, 3.0)],
             "wind_weak": lambda: [drag("hull", quadratic=40.0, wind=(0.2, 0.1, 0.0))],
             "wind_strong": lambda: [drag("hull", quadratic=40.0, wind=(0.5, -0.3, 0.0))],
             "gain_weak": lambda: [gain("back_left", 2, 0.9)],

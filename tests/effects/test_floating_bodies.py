@@ -40,7 +40,7 @@ def speeds(q):
     return np.diff(q[:, :3], axis=0) / CONTROL
 
 
-def resistance(qvel, drag, medium, dt=1e-6, quat=(1, 0, 0, 0)):
+def resistance(qvel, drag, medium, dt=1e-6, quat=(1, 0, 0, 0), axes=None):
     """Generalised force `[7]` of one sub-step, and the model and data of MuJoCo C that it is computed from."""
     model = mujoco.MjModel.from_xml_string(XML)
     data = mujoco.MjData(model)
@@ -51,13 +51,21 @@ def resistance(qvel, drag, medium, dt=1e-6, quat=(1, 0, 0, 0)):
     at = make("wind", where="drone").bind(model, 0.004, 1)
     force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
     step = SimpleNamespace(data=data, qvel=data.qvel, inverse=inverse, force=force, dt=dt)
-    return np.asarray(resisted(at, step, np.float32([drag]), np.float32([medium]))), model, data
+    axes = None if axes is None else np.float32([axes])
+    return np.asarray(resisted(at, step, np.float32([drag]), np.float32([medium]), axes)), model, data
 
 
 def test_at_its_final_speed_drag_carries_the_weight_whatever_the_timestep():
     for drag, speed in (([4.0, 0, 0], WEIGHT / 4), ([0, 2.0, 0], np.sqrt(WEIGHT / 2))):
         force, *_ = resistance([0, 0, -speed, 0, 0, 0, 0], drag, [0, 0, 0], dt=0.02)
         np.testing.assert_allclose(force[:3], [0, 0, WEIGHT], atol=1e-4)
+
+
+def test_drag_of_an_axis_is_that_of_the_body_however_it_is_turned():
+    """A body on its side, that moves along its own y axis (the world's -x), feels the factor of y alone."""
+    side = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
+    force, *_ = resistance([-2.0, 0, 0, 0, 0, 0, 0], [0.5, 0.1, 0], [0, 0, 0], quat=side, axes=[1, 3, 9])
+    np.testing.assert_allclose(force[:3], [3 * (0.5 + 0.1 * 2) * 2, 0, 0], atol=1e-4)
 
 
 def test_drag_acts_at_the_centre_of_mass_along_the_air_that_comes_by():
@@ -140,9 +148,12 @@ def test_tumbling_under_thrust_it_moves_as_in_mujoco():
 @pytest.mark.ci
 def test_still_air_is_wind_at_no_speed_and_neutral_changes_no_bit():
     drag = physics(XML, [make("body_drag", where="drone")])
+    sides = physics(XML, [make("directional_drag", where="drone")])
     spin = (1, -2, 0, 0.5, 1.0, -2.0, 0)
     (one,) = moved(drag, [[0.4, 0.2, 0.01]], IDLE, START, spin)
     np.testing.assert_array_equal(flown([0.4, 0.2, 0.01, 0, 0, 0], qvel=spin), one)
+    (even,) = moved(sides, [[0.4, 0.2, 0.01, 1, 1]], IDLE, START, spin)
+    np.testing.assert_array_equal(even, one)
     (off,) = moved(drag, [[0.0] * 3], IDLE, START, spin)
     bare = moved(physics(XML, []), [[]], IDLE, START, spin)[0]
     np.testing.assert_array_equal(off, bare)
@@ -150,7 +161,7 @@ def test_still_air_is_wind_at_no_speed_and_neutral_changes_no_bit():
 
 def test_only_floating_bodies_carry_them():
     model = mujoco.MjModel.from_xml_string(XML)
-    for name in ("body_drag", "wind"):
+    for name in ("body_drag", "directional_drag", "wind"):
         assert places(make(name, where="all"), model) == ("drone",)
         with pytest.raises(UserError, match="body 'arm' .*allowed: drone"):
             physics(XML, [make(name, where="arm")])

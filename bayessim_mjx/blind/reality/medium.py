@@ -17,7 +17,8 @@ class BodyDrag(Cause):
     name = "body_drag"
     kind = "body"
     stepped = True
-    still = (0.0, 0.0, 0.0)
+    still = (0.0, 0.0, 0.0)  # velocity of the medium
+    axes = (1.0, 1.0, 1.0)  # factors along the body's axes
 
     def draw(self, rng: np.random.Generator) -> None:
         self.growth, self.turns = (float(x) for x in rng.uniform(size=2) < 0.5)  # 1/(m/s); m^2 times a hundred
@@ -26,13 +27,27 @@ class BodyDrag(Cause):
     def force(self, plant: Simulated) -> None:
         body, v = plant.model.body(self.where).id, np.zeros(6)
         mujoco.mj_objectVelocity(plant.model, plant.data, mujoco.mjtObj.mjOBJ_BODY, body, v, 0)  # of the centre of mass
-        along = v[3:] - np.array(self.still)
-        plant.data.xfrc_applied[body, :3] -= self.size * (1 + self.growth * np.linalg.norm(along)) * along
+        along, frame = v[3:] - np.array(self.still), plant.data.xmat[body].reshape(3, 3)
+        push = self.size * (1 + self.growth * np.linalg.norm(along)) * (frame @ (self.axes * (frame.T @ along)))
+        plant.data.xfrc_applied[body, :3] -= push
         plant.data.xfrc_applied[body, 3:] -= 0.01 * self.turns * self.size * v[:3]
 
     def parameters(self) -> dict[str, float]:
         own = {"linear": self.size, "quadratic": self.growth * self.size, "turning": 0.01 * self.turns * self.size}
         return {name: float(value) for name, value in own.items()}
+
+
+class DirectionalDrag(BodyDrag):
+    """Drag that differs by the body's axes."""
+
+    name = "directional_drag"
+
+    def draw(self, rng: np.random.Generator) -> None:
+        super().draw(rng)
+        self.axes = (1.0, *(float(x) for x in np.exp(rng.uniform(-1.2, 1.2, 2))))
+
+    def parameters(self) -> dict[str, float]:
+        return super().parameters() | {"side": self.axes[1], "up": self.axes[2]}
 
 
 class Wind(BodyDrag):

@@ -41,7 +41,7 @@ def places(system: Rig, effect: str, scales: Scales) -> list[str]:
         return ["world"] if system.tilts and standing else []
     if kind == "geom":
         return list(system.touching)
-    if effect in ("body_drag", "wind"):
+    if effect in ("body_drag", "directional_drag", "wind"):
         return list(scales.floats)
     if kind == "body":  # what is carried is carried at the end
         return list(scales.length if effect == "inertial_parameters" else scales.ends)

@@ -51,40 +51,45 @@ def project(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray, force: jax
     return jnp.sum(data.cdof * (moved(model)[ids].T @ wrench), axis=1)  # sum_b J_b^T f_b
 
 
-def resisted(at: Site, step: SubStep, drag: jax.Array, medium: jax.Array) -> jax.Array:
+def resisted(at: Site, step: SubStep, drag: jax.Array, medium: jax.Array, axes: jax.Array | None = None) -> jax.Array:
     """Generalised force `[nv]` of drag at the site's bodies, each in a tree of its own, half-way through the sub-step.
 
-    (1 + dt K A / 2) f = -K (velocity with all other forces, half-way), A = J M^-1 J^T, K = diag(r, r, r, q, q, q),
-    q = k + c |velocity half-way|: second order in dt where speeds lie half a sub-step before positions.
+    (1 + dt K A / 2) f = -K (velocity with all other forces, half-way), A = J M^-1 J^T, K = diag(r, r, r, q a), in the
+    body's axes, q = k + c |velocity half-way|: second order in dt where speeds lie half a sub-step before positions.
 
     Args:
         drag: `[n, 3]` (k, c, r) of DRAG, >= 0; medium: `[n, 3]` or `[3]`, its velocity in the world, m/s.
+        axes: `[n, 3]`, factors a of the body's axes; None: 1.
     """
-    jacobian = _jacobian(at.mj_model, step.data, at.ids)
-    still = jnp.concatenate([jnp.zeros((len(at), 3)), jnp.broadcast_to(medium, (len(at), 3))], axis=1)
+    frame = jnp.swapaxes(jnp.reshape(step.data.xmat, (-1, 3, 3))[at.ids], 1, 2)
+    jacobian = _jacobian(at.mj_model, step.data, at.ids, frame)
+    still = jnp.matmul(frame, jnp.broadcast_to(medium, (len(at), 3))[..., None])[..., 0]
+    still = jnp.concatenate([jnp.zeros((len(at), 3)), still], axis=1)
     now = jnp.sum(jacobian * step.qvel, axis=-1) - still
     half, unit = 0.5 * step.dt, jnp.eye(6)
     later = now + half * jnp.sum(jacobian * jnp.sum(step.inverse * step.force, axis=-1), axis=-1)
     out = jnp.zeros(at.nv)
     for i in range(len(at)):
         along, quadratic, turning = drag[i]
+        share = jnp.ones(3) if axes is None else axes[i]
         mobility, middle, force = jnp.matmul(jnp.matmul(jacobian[i], step.inverse), jacobian[i].T), now[i], now[i]
         for _ in range(ROUNDS):
             square = jnp.sum(middle[3:] ** 2)
             speed = jnp.sqrt(jnp.where(square > 0, square, TINY))  # where: the root has no slope at 0
-            own = jnp.stack([turning, along + quadratic * speed])[np.repeat([0, 1], 3)]
+            own = jnp.concatenate([jnp.full(3, turning), (along + quadratic * speed) * share])
             force = -jnp.matmul(inverse(unit + half * own[:, None] * mobility), own * later[i])
             middle = later[i] + half * jnp.matmul(mobility, force)
         out = out + jnp.sum(jacobian[i] * force[:, None], axis=0)
     return out
 
 
-def _jacobian(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray) -> jax.Array:
-    """`[n, 6, nv]`, angular velocity and that of the centre of mass in the world, of the bodies, by qvel."""
+def _jacobian(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray, frame: jax.Array) -> jax.Array:
+    """`[n, 6, nv]`, angular velocity and that of the centre of mass, by qvel; frame: `[n, 3, 3]`, axes of the bodies."""
     turn, move = jnp.split(data.cdof, 2, axis=1)
     move = move + jnp.cross(turn, _arm(model, data, ids)[:, None])  # [n, nv, 3]
-    both = jnp.concatenate([jnp.broadcast_to(turn, move.shape), move], axis=-1)
-    return jnp.swapaxes(both * moved(model)[ids][:, :, None], 1, 2)
+    turn = jnp.broadcast_to(turn, move.shape)
+    both = [jnp.matmul(frame, jnp.swapaxes(x * moved(model)[ids][:, :, None], 1, 2)) for x in (turn, move)]
+    return jnp.concatenate(both, axis=1)
 
 
 def _arm(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray) -> jax.Array:

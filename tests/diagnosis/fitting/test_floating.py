@@ -58,7 +58,16 @@ def test_ranges_grow_with_thrust_and_speed():
     assert here["rate"] == pytest.approx(3.0, rel=0.01) and here["moment"] == pytest.approx(9e-3 * 18, rel=0.05)
 
 
-EVERYWHERE = {"body_drag", "wind", "payload", "inertial_parameters", "external_force", "actuator_gain", "actuator_lag"}
+EVERYWHERE = {
+    "body_drag",
+    "directional_drag",
+    "wind",
+    "payload",
+    "inertial_parameters",
+    "external_force",
+    "actuator_gain",
+    "actuator_lag",
+}
 
 
 @pytest.mark.parametrize("text", [ALONE, BESIDE])
@@ -80,4 +89,4 @@ def test_fixed_robots_hear_nothing_of_floating_bodies():
     one = Log("it", *(np.arange(0, 2, 0.01), *3 * [np.zeros((200, 1))]), True, Channels.of(model), *2 * [np.ones(1)])
     stack, left_out = candidates.stack(candidates.kinds_of("all"), scales.measure(model, [one]))
     said = {e.name for e in stack} | {text.split(":")[0] for text in left_out}
-    assert not said & {"body_drag", "wind"} and "payload" in said
+    assert not said & {"body_drag", "directional_drag", "wind"} and "payload" in said
