@@ -346,5 +346,8 @@ if __name__ == "__main__":
     parser.add_argument("out")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pose", action="store_true", help="log no velocities, as motion capture does")
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=4.0)
     asked = parser.parse_args()
+    ROBOTS[asked.robot] = dataclasses.replace(ROBOTS[asked.robot], runs=asked.runs, seconds=asked.seconds)
     print(write(asked.robot, asked.case, asked.out, asked.seed, not asked.pose))

@@ -84,7 +84,7 @@ def resisted(at: Site, step: SubStep, drag: jax.Array, medium: jax.Array, axes: 
 
 
 def _jacobian(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray, frame: jax.Array) -> jax.Array:
-    """`[n, 6, nv]`, angular velocity and that of the centre of mass, by qvel; frame: `[n, 3, 3]`, axes of the bodies."""
+    """`[n, 6, nv]`, angular velocity and that of the centre of mass, by qvel; frame: `[n, 3, 3]`, axes of bodies."""
     turn, move = jnp.split(data.cdof, 2, axis=1)
     move = move + jnp.cross(turn, _arm(model, data, ids)[:, None])  # [n, nv, 3]
     turn = jnp.broadcast_to(turn, move.shape)
