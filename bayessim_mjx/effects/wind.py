@@ -30,7 +30,6 @@ class Wind(Effect):
     noun: ClassVar[str] = "wind or current"
     lacks: ClassVar[str] = "wind or a current"
     separates: ClassVar[str] = "straight runs at three constant speeds, to and fro, along two directions"
-    witness: ClassVar[tuple[str, str] | None] = ("wind", "an anemometer beside the robot (`wind`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         *DRAG,
         *(
