@@ -64,7 +64,7 @@ WHEELED = f"""<mujoco model="wheeled">
   <option timestep="0.0025" integrator="implicitfast" iterations="6" ls_iterations="6"/>
   <default><geom condim="3" solref=".02 1"/></default>
   <worldbody>
-    <geom name="floor" type="plane" size="10 10 .1" friction=".2 .005 .0001"/>
+    <geom name="floor" type="plane" size="10 10 .1" friction=".02 .005 .0001"/>
     <body name="chassis">
       <freejoint name="root"/>
       <inertial pos="-.03 0 .07" mass="5" diaginertia=".04 .06 .08"/>
