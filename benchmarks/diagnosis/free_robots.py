@@ -145,6 +145,6 @@ def dive(q: Array, v: Array, t: float, run: int) -> Array:
 def drive(q: Array, v: Array, t: float, run: int) -> Array:
     """Drive the wheels by torques after speeds that change in steps and waves."""
     w = 1.5 + 0.4 * run
-    ahead = [4.0, 7.0, 5.0, 9.0, 6.0][run] * np.sin(w * t) + (3.0 if run % 2 else 0.0) * np.sign(np.sin(0.7 * w * t))
+    ahead = [4.0, 7.0, 5.0, 9.0, 6.0][run] * np.sin(w * t) + (4.0 if run % 2 else 2.0) * np.sign(np.sin(0.7 * w * t))
     turn = [2.0, 1.0, 3.0, 2.0, 4.0][run] * np.sin(0.6 * w * t + run)
-    return np.clip(0.12 * (np.array([ahead - turn, ahead + turn]) - v[6:8]), -3, 3)
+    return np.clip(0.25 * (np.array([ahead - turn, ahead + turn]) - v[6:8]), -3, 3)
