@@ -82,6 +82,17 @@ def test_drag_load_and_rotors_are_on_offer(text):
     assert any(t.startswith("cogging") for t in left_out) == (text == ALONE)
 
 
+def test_thrusters_at_the_free_joint_itself_are_rotors_too():
+    """Such an actuator has six gears and no angle."""
+    text = ALONE.replace('site="left" gear="0 0 1 0 0 .02"', 'joint="root" gear="0 0 2 0 0 .02"')
+    model = robot.robot_of(mujoco.MjSpec.from_string(text)).mj_model
+    size = scales.measure(model, [log(model)])
+    stack, _ = candidates.stack(candidates.kinds_of("all"), size)
+    places = {e.name: e.places() for e in stack}
+    assert set(places) >= EVERYWHERE and places["actuator_lag"] == ("left", "right") and "cogging" not in places
+    assert size.at("body", "drone")["force"] == pytest.approx(15.0, rel=1e-6)
+
+
 def test_fixed_robots_hear_nothing_of_floating_bodies():
     spec = mujoco.MjSpec.from_string(BESIDE)
     spec.delete(spec.body("drone"))
