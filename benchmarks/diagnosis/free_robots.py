@@ -58,7 +58,7 @@ VEHICLE = """<mujoco model="vehicle">
 _WHEEL = """
       <body name="{side}_wheel" pos="0 {y} .06">
         <joint name="{side}_wheel" axis="0 1 0" damping=".01" armature=".002"/>
-        <geom name="{side}_tyre" type="ellipsoid" size=".06 .01 .06" mass=".3" friction=".8 .005 .0001"/>
+        <geom name="{side}_tyre" type="ellipsoid" size=".06 .01 .06" mass=".3" friction="1.2 .005 .0001"/>
       </body>"""
 WHEELED = f"""<mujoco model="wheeled">
   <option timestep="0.0025" integrator="implicitfast" iterations="6" ls_iterations="6"/>
@@ -147,4 +147,4 @@ def drive(q: Array, v: Array, t: float, run: int) -> Array:
     w = 1.5 + 0.4 * run
     ahead = [4.0, 7.0, 5.0, 9.0, 6.0][run] * np.sin(w * t) + (4.0 if run % 2 else 2.0) * np.sign(np.sin(0.7 * w * t))
     turn = [2.0, 1.0, 3.0, 2.0, 4.0][run] * np.sin(0.6 * w * t + run)
-    return np.clip(0.25 * (np.array([ahead - turn, ahead + turn]) - v[6:8]), -3, 3)
+    return np.clip(0.18 * (np.array([ahead - turn, ahead + turn]) - v[6:8]), -3, 3)
