@@ -149,7 +149,11 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
                 continue
             except UserError as error:
                 whys.append(str(error))
-        why = whys[0] if found else f"no {kind.kind} here that could carry it and was excited"
+        why = (
+            whys[0].removeprefix(f"{kind.name}: ")
+            if found
+            else f"no {kind.kind} here that could carry it and was excited"
+        )
         if found or not kind.floats:
             without.setdefault(why, []).append(kind.name)
     return tuple(made), [f"{', '.join(names)}: {why}" for why, names in without.items()]

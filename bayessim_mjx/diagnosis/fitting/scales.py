@@ -200,6 +200,8 @@ def _product(expression: str, here: dict[str, float], effect: type[Effect]) -> f
         if word in ("1", ""):
             continue
         if word not in here:
-            raise UserError(f"{effect.name}: range per {word!r}; a {effect.kind} has {', '.join(here) or 'no scales'}")
+            raise UserError(
+                f"{effect.name}: its range grows with {word!r}; this {effect.kind} has {', '.join(here) or 'none'}"
+            )
         value *= here[word] ** ((-1 if i else 1) * float(power or 1))
     return value
