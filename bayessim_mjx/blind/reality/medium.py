@@ -17,8 +17,8 @@ class BodyDrag(Cause):
     name = "body_drag"
     kind = "body"
     stepped = True
-    still = (0.0, 0.0, 0.0)  # velocity of the medium
-    axes = (1.0, 1.0, 1.0)  # factors along the body's axes
+    still: tuple[float, ...] = (0.0, 0.0, 0.0)  # velocity of the medium
+    axes: tuple[float, ...] = (1.0, 1.0, 1.0)  # factors along the body's axes
 
     def draw(self, rng: np.random.Generator) -> None:
         self.growth, self.turns = (float(x) for x in rng.uniform(size=2) < 0.5)  # 1/(m/s); m^2 times a hundred
