@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting import candidates, robot, scales
+from bayessim_mjx.effects import make
+from bayessim_mjx.effects.support.native import write_model
 from bayessim_mjx.logs import Channels, Log
+from bayessim_mjx.parameters import ParameterSpace
 
 DRONE = """<mujoco><option timestep="0.005"/><worldbody><body name="drone" pos="0 0 1"><freejoint name="root"/>
 <inertial pos="0 0 0" mass=".8" diaginertia="5e-3 6e-3 9e-3"/><site name="left" pos="0 .15 0"/>
@@ -48,6 +51,19 @@ def test_its_centre_of_mass_may_move_in_a_model_of_the_same_numbers():
             mujoco.mj_step(model, data)
         runs.append(data.qpos.copy())
     np.testing.assert_allclose(runs[1], runs[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["payload", "inertial_parameters"])
+def test_what_moves_its_centre_of_mass_is_written_into_its_mjcf(name):
+    spec, effect = mujoco.MjSpec.from_string(ALONE), make(name, where="drone")
+    values = {p.name: p.nominal for p in effect.space().parameters} | {f"drone.{name}.com_x": 0.02}
+    values |= {"drone.payload.mass": 0.2} if name == "payload" else {}
+    new, missing = write_model(spec, ParameterSpace(), [], [effect], values)
+    model = new.compile()
+    centre = 0.2 * 0.02 / 1.0 if name == "payload" else 0.02
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert missing == [] and data.subtree_com[1][0] == pytest.approx(centre)
 
 
 def test_ranges_grow_with_thrust_and_speed():
