@@ -12,7 +12,7 @@ import numpy as np
 
 from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.effects.support.quantity import Quantity
-from bayessim_mjx.effects.support.site import Site, find, under_tendon_limit
+from bayessim_mjx.effects.support.site import Site, find, floating, under_tendon_limit
 from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -64,6 +64,7 @@ class Effect(abc.ABC):
     loop: ClassVar[str] = ""  # number of a controller (kp, kd) that it multiplies; on offer where logs declare one
     # whether its number is a time by which a signal of its joint is late
     late: ClassVar[bool] = False
+    floats: ClassVar[bool] = False  # only bodies with a free joint carry it; nothing is said of it where there are none
     offered: ClassVar[bool] = True  # among all the effects that a diagnosis tries; else only where it is named
     # for people; where these are empty, `support.words` says something by name and docstring
     noun: ClassVar[str] = ""  # what it is called: "command delay"
@@ -76,7 +77,7 @@ class Effect(abc.ABC):
     @classmethod
     def carries(cls, model: "mujoco.MjModel", i: int) -> bool:
         """Whether element `i` of its kind has what the effect changes (a servo's gains); it is on offer only there."""
-        return True
+        return not cls.floats or floating(model, i)
 
     def places(self) -> tuple[str, ...]:
         """Names that own a set of parameters."""

@@ -40,7 +40,7 @@ WRONG = {
     "diagnose --model none.xml --data logs": "--model none.xml: no such file",
     "diagnose --model broken.xml --data logs": "broken.xml: MuJoCo cannot load it",
     "diagnose --model note.txt --data logs": "note.txt: MuJoCo cannot load it",
-    "diagnose --model still.xml --data logs": "still.xml: the model has no hinge or slide joint",
+    "diagnose --model still.xml --data logs": "still.xml: the model has no joint",
     "diagnose --model arm.xml --data none": "none: no such file or folder; allowed: a folder of logs",
     "diagnose --model arm.xml --data empty": "empty: no log matches '*'; it holds nothing; allowed: CSV",
     "diagnose --model arm.xml --data letters": "letters/a.csv: line 3, column 'qpos:hinge': 'a' is not a number",

@@ -55,6 +55,7 @@ class Scales:
         direct: actuators without a filter of their own; led: those that follow positions or velocities.
         length: m, of the rod that turns as hard, by body that turns; axis: of its own hinge, [3] in its frame, zeros of
             a body that has another number of them. ground: whether there is any that can be touched.
+        floats: bodies that have a free joint.
         chain: (joint before, first joint behind) of each joint, "" where there is none.
     """
 
@@ -77,6 +78,7 @@ class Scales:
     length: dict[str, float]
     axis: dict[str, np.ndarray]
     ground: bool
+    floats: tuple[str, ...]
     chain: dict[str, tuple[str, str]]
 
 

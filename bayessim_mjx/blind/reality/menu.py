@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayessim_mjx.blind.reality import actuators, bodies, drives, joints, others, unknown
+from bayessim_mjx.blind.reality import actuators, bodies, drives, joints, medium, others, unknown
 from bayessim_mjx.blind.reality.cause import Cause, Scales
 from bayessim_mjx.blind.reality.plant import Rig
 
@@ -16,7 +16,7 @@ def _causes(*rooms: object) -> dict[str, type[Cause]]:
     return {c.name: c for c in every if "name" in vars(c)}
 
 
-KNOWN = _causes(joints, actuators, others, drives, bodies)
+KNOWN = _causes(joints, actuators, others, drives, bodies, medium)
 UNKNOWN = _causes(unknown)  # no library has them
 CAUSES = KNOWN | UNKNOWN
 
@@ -41,6 +41,8 @@ def places(system: Rig, effect: str, scales: Scales) -> list[str]:
         return ["world"] if system.tilts and standing else []
     if kind == "geom":
         return list(system.touching)
+    if effect in ("body_drag", "directional_drag", "wind"):
+        return list(scales.floats)
     if kind == "body":  # what is carried is carried at the end
         return list(scales.length if effect == "inertial_parameters" else scales.ends)
     return list(scales.rotors) if effect in _ROTOR else list(scales.force)

@@ -277,6 +277,7 @@ def scales_of(plant: Plant, runs: Sequence[Run]) -> Scales:
         length={model.body(i).name: length(model, i) for i in turned},
         axis={model.body(i).name: axis(model, i) for i in turned},
         ground=bool(ground(plant.system.spec())),
+        floats=tuple(model.body(int(model.jnt_bodyid[j])).name for j in np.flatnonzero(model.jnt_type == 0)),
         chain=chain(model, plant.joints),
     )
 

@@ -132,21 +132,31 @@ def kinds_of(effects: str | Sequence[str | type[Effect]]) -> list[type[Effect]]:
 
 def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, ...], list[str]]:
     """One Effect per kind over all of its places, each with values and ranges of its own; and what is left out."""
-    made, left_out = [], []
+    made, without = [], dict[str, list[str]]()
     for kind in kinds:
         found = tuple(p for p in places(kind, scales.model) if _alive(kind, p, scales))
-        if not found:
-            left_out.append(f"{kind.name}: no {kind.kind} here that could carry it and was excited")
-            continue
-        try:
-            parameters = tuple(p for place in found for p in ranges(kind, place, scales))
-            effect = kind(where=found, parameters=parameters)
-            effect.bind(scales.model, float(scales.model.opt.timestep), 1)
-        except UserError as error:
-            left_out.append(f"{kind.name}: {error}")
-            continue
-        made.append(effect)
-    return tuple(made), left_out
+        own, whys = dict[str, tuple[Parameter, ...]](), list[str]()
+        for place in found:
+            try:
+                own[place] = ranges(kind, place, scales)
+            except UserError as error:  # a rotor at a site has no travel
+                whys.append(str(error))
+        if found and own:
+            try:
+                effect = kind(where=tuple(own), parameters=tuple(p for each in own.values() for p in each))
+                effect.bind(scales.model, float(scales.model.opt.timestep), 1)
+                made.append(effect)
+                continue
+            except UserError as error:
+                whys.append(str(error))
+        why = (
+            whys[0].removeprefix(f"{kind.name}: ")
+            if found
+            else f"no {kind.kind} here that could carry it and was excited"
+        )
+        if found or not kind.floats:
+            without.setdefault(why, []).append(kind.name)
+    return tuple(made), [f"{', '.join(names)}: {why}" for why, names in without.items()]
 
 
 def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:

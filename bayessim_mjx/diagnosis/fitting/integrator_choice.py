@@ -84,7 +84,8 @@ def coarsest_stable(model: mujoco.MjModel, logs: Sequence[Log], precise: bool = 
         precise: RK4 goes before both.
     """
     own, h = int(model.opt.integrator), float(model.opt.timestep)
-    kinds = dict.fromkeys([RK4] * precise + [own, IMPLICITFAST])
+    fluid = model.opt.density > 0 or model.opt.viscosity > 0  # MJX has no fluid forces by implicitfast
+    kinds = dict.fromkeys([RK4] * precise + [own] + [IMPLICITFAST] * (not fluid))
     cases = {kind: list(_cases(model, logs, kind)) for kind in kinds}
     factors = {kind: max((case.factor(h) for case in cases[kind]), default=1) for kind in kinds}
     best = min(kinds, key=lambda kind: factors[kind])

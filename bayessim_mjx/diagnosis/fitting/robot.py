@@ -16,6 +16,7 @@ from bayessim_mjx.config import foreign
 from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.fitting.simulable import check, contacts, label, one_line, unreached
 from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.effects.support.bodies import whole_inertia
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import ParameterSpace, elements
@@ -164,7 +165,7 @@ def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path
         warnings.warn(text, stacklevel=3)
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     moved_to_joints(spec)
-    model = _by_mujoco("compile", source, spec.compile)
+    model = whole_inertia(spec, _by_mujoco("compile", source, spec.compile))
     check(model, source)
     return Robot(model, spec.copy, None, _space(model, parameters), name)._from_data_sheet(parameters is None)
 

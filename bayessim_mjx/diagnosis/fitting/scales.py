@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.logcheck import drives
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.site import element_names
+from bayessim_mjx.effects.support.site import element_names, floating
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import Parameter
@@ -58,9 +58,8 @@ class Scales:
             return self._of_dof(int(model.jnt_dofadr[element_names(model, "joint").index(place)]))
         if kind == "actuator":
             i = element_names(model, "actuator").index(place)
-            joint = int(model.actuator_trnid[i, 0])
-            on_joint = int(model.actuator_trntype[i]) <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-            own = self._of_dof(int(model.jnt_dofadr[joint])) if on_joint else {}
+            dof = drives.dof_of(model, i)
+            own = {} if dof is None else self._of_dof(dof)
             if own:
                 own["travel"] *= abs(float(model.actuator_gear[i, 0])) or 1.0  # of the actuator's own length
             return own | {"command": float(self.command[i]), "force": float(self.effort[i]), "period": self.period}
@@ -71,8 +70,16 @@ class Scales:
             mass = max(float(model.body_mass[i]), 0.1 * below)
             load = max(LIMITS.load * mass, float(self.carried[i]))
             own = {"mass": mass, "weight": below * gravity, "size": drives.size(model, i)}
+            own |= self._of_floating(int(model.body_dofadr[i])) if floating(model, i) else {}
             return own | {"carried": load, "tool": drives.reach(model, i)}
         return {"moment": _moment(model)}
+
+    def _of_floating(self, v: int) -> dict[str, float]:
+        """Of a free joint's six degrees of freedom: the largest of three along, and of three about axes."""
+        along, about = slice(v, v + 3), slice(v + 3, v + 6)
+        parts = {"force": self.force[along], "speed": self.speed[along]}
+        parts |= {"moment": self.force[about], "rate": self.speed[about]}
+        return {word: float(np.max(part)) for word, part in parts.items()} | {"period": self.period}
 
     def _of_dof(self, v: int) -> dict[str, float]:
         words = ("force", "speed", "travel", "inertia")
@@ -88,22 +95,29 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
     speed = _large([log.qvel for log in logs])
     ptp = np.max([_span(model, log) for log in logs], axis=0)
     data = mujoco.MjData(model)
-    torque, inertia, places = [], [], []
+    torque, driven, inertia, places = [], [], [], []
+    floats = np.flatnonzero(model.jnt_type[model.dof_jntid] == int(mujoco.mjtJoint.mjJNT_FREE))
     for log in logs:
+        ctrl = drives.controlled(log, model) if len(floats) else log.ctrl
         acceleration = np.gradient(log.qvel, log.time, axis=0)
         for k in range(0, len(log), max(1, len(log) // 100)):
             places.append(log.qpos[k])
             data.qpos[:], data.qvel[:], data.qacc[:] = log.qpos[k], log.qvel[k], acceleration[k]
             mujoco.mj_inverse(model, data)
             torque.append(np.abs(data.qfrc_inverse))
+            if len(floats):
+                data.ctrl[:] = ctrl[k]
+                mujoco.mj_fwdActuation(model, data)
+                driven.append(np.abs(data.qfrc_actuator))
             inertia.append(np.diag(mass_matrix(model, data)))
     command = _large([log.ctrl for log in logs])
     force = np.percentile(torque, LIMITS.large, axis=0)
+    if len(floats):  # a body that drag holds at a steady speed needs no force by a model without drag
+        force[floats] = np.maximum(force[floats], np.percentile(driven, LIMITS.large, axis=0)[floats])
     effort = np.zeros(model.nu)
     for i in range(model.nu):
         gear = float(model.actuator_gear[i, 0]) or 1.0
-        joint = int(model.actuator_trnid[i, 0])
-        on_joint = int(model.actuator_trntype[i]) <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        joint, on_joint = int(model.actuator_trnid[i, 0]), drives.dof_of(model, i) is not None
         needed = float(force[model.jnt_dofadr[joint]]) / abs(gear) if on_joint else 0.0
         direct = command[i] * abs(float(model.actuator_gainprm[i, 0])) if model.actuator_biasprm[i, 1] == 0 else 0.0
         effort[i] = max(needed, direct, 1e-9)
@@ -188,6 +202,8 @@ def _product(expression: str, here: dict[str, float], effect: type[Effect]) -> f
         if word in ("1", ""):
             continue
         if word not in here:
-            raise UserError(f"{effect.name}: range per {word!r}; a {effect.kind} has {', '.join(here) or 'no scales'}")
+            raise UserError(
+                f"{effect.name}: its range grows with {word!r}; this {effect.kind} has {', '.join(here) or 'none'}"
+            )
         value *= here[word] ** ((-1 if i else 1) * float(power or 1))
     return value

@@ -25,8 +25,8 @@ def one_line(error: Exception) -> str:
 
 def check(model: mujoco.MjModel, source: str) -> None:
     """Refuse a model without motion or commands, and what MJX cannot simulate."""
-    if not np.isin(model.jnt_type, AXIAL).any():
-        raise UserError(f"{source}: the model has no hinge or slide joint, so there is no motion to compare")
+    if not model.njnt:
+        raise UserError(f"{source}: the model has no joint, so there is no motion to compare")
     if not model.nu:
         raise UserError(
             f"{source}: the model has no actuator, so the logged commands cannot act on it; allowed: --drive torque "

@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 
 from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.effects.support.bodies import whole_inertia
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 
@@ -51,7 +52,7 @@ def _values(effect: Effect, given: Mapping[str, float]) -> Values:
 def _add(spec: mujoco.MjSpec, effect: Effect, values: Values) -> tuple[mujoco.MjSpec, str | None]:
     """(spec with the effect, None), or (the spec as it was, why it is not in there)."""
     new = spec.copy()
-    model = new.compile()
+    model = whole_inertia(new, new.compile())
     at = effect.bind(model, float(model.opt.timestep), 1)  # refuses unknown places
     if effect.where == "all":
         values = {place: values["all"] for place in at.names}

@@ -13,6 +13,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters.attributes import suggest
 
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
@@ -145,6 +146,11 @@ def _usable(model: mujoco.MjModel, kind: str, i: int) -> bool:
     if kind == "joint":
         return int(model.jnt_type[i]) in (_HINGE, _SLIDE)
     return model.body_mass[i] > 0 and model.body_weldid[i] != 0 if kind == "body" else True
+
+
+def floating(model: mujoco.MjModel, body: int) -> bool:
+    """Whether a body has a free joint."""
+    return bool(model.body_jntnum[body]) and int(model.jnt_type[model.body_jntadr[body]]) == _FREE
 
 
 def _id(effect: Placed, place: str, names: list[str], usable: list[int]) -> int:

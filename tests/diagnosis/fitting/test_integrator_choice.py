@@ -62,6 +62,15 @@ def test_a_nearly_massless_axis_is_left_to_the_implicit_integrator():
     assert found.changed and found.factor == 1  # not so in that of Runge and Kutta
 
 
+def test_in_a_fluid_the_integrator_stays_which_mjx_can_simulate():
+    """The same nearly massless axis: MJX has no fluid forces by implicitfast."""
+    light = {"h": 0.01, "damping": 20.0, "mass": 1e-3, "actuator": '<velocity name="motor" joint="rail" kv="50"/>'}
+    air, water = model(**light), model(**light)
+    water.opt.density = 1000.0
+    assert needed(air).integrator == integrator_choice.IMPLICITFAST
+    assert needed(water).integrator == int(mujoco.mjtIntegrator.mjINT_EULER)
+
+
 def test_what_falls_over_is_not_unstable():
     falling = model(0.01, stiffness=-400.0)  # grows by e in 0.05 s
     assert needed(falling).factor == 1
