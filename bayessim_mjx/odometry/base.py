@@ -19,6 +19,7 @@ from bayessim_mjx.odometry.smoother import Inputs, Noise, Track
 # of the accelerometer's noise that its samples show: vibration and shocks between samples add to it. The most likely
 # one is taken. Rules of thumb, not counted
 ROUGH = (1.0, 3.0, 10.0, 30.0)
+ROWS = 300  # of a log, that choose it: a choice between seconds and accuracy, not counted
 LEAST = (1e-4, 5e-3)  # rad/s and m/s^2, noise of a gyroscope and an accelerometer at least: good sensors; rules of thumb
 SETTLED = 0.2  # s at a log's begin, over which the first vertical is averaged; a rule of thumb
 
@@ -88,7 +89,8 @@ def estimate(log: Log, model: mujoco.MjModel) -> Base:
 
     first = inputs(attitude, None)
     rough = [Noise(levels[0], levels[1] * times) for times in ROUGH]
-    noise, track = smoother.best(first, rough, attitude[0])
+    noise = smoother.likeliest(first.cut(ROWS), rough, attitude[0])
+    track = smoother.smooth(first, noise, attitude[0])
     second = inputs(track.attitude, track.position[:, 2])
     track = smoother.smooth(second, noise, track.attitude[0])
     found = _base(track, second, every, np.abs(gyro.turn) @ gyro.noise(log))

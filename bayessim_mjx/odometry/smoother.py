@@ -8,6 +8,7 @@ and heading are fixed at the first row: nothing measures them.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -72,6 +73,14 @@ class Inputs:
     per_second: float
     gravity: float
     feet: Feet
+
+    def cut(self, rows: int) -> Inputs:
+        """Return the first rows."""
+        own, feet = slice(0, rows), self.feet
+        points = {name: getattr(feet, name)[own] for name in ("point", "spread", "rolled", "rests")}
+        given = {name: getattr(self, name)[own] for name in ("time", "rate", "force")}
+        vertical = None if self.vertical is None else self.vertical[own]
+        return dataclasses.replace(self, **given, vertical=vertical, feet=dataclasses.replace(feet, **points))
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,8 +267,6 @@ class _Filter:
         )
 
 
-def best(inputs: Inputs, noise: Sequence[Noise], quat: Array) -> tuple[Noise, Track]:
-    """Return the noise that makes the measurements most likely, and the motion by it."""
-    tried = [(_Filter(inputs, own, quat), own) for own in noise]
-    found, own = max(tried, key=lambda pair: np.nan_to_num(pair[0].likelihood, nan=-np.inf))
-    return own, found.back()
+def likeliest(inputs: Inputs, noise: Sequence[Noise], quat: Array) -> Noise:
+    """Return the noise that makes the measurements most likely. quat: `[4]`, the first orientation."""
+    return max(noise, key=lambda own: float(np.nan_to_num(_Filter(inputs, own, quat).likelihood, nan=-np.inf)))

@@ -17,12 +17,12 @@ import numpy as np
 STEP = 5e-4  # s, of the reality
 MODEL_STEP = 2e-3  # s, of the nominal model
 SETTLE = 1.0  # s before a log begins
-GAINS = {"bars": (120.0, 3.0), "quadruped": (120.0, 3.0)}  # N m/rad, N m s/rad of the position servos
+SERVO = (120.0, 3.0)  # N m/rad, N m s/rad of the position servos of legs
 
 
 @dataclasses.dataclass(frozen=True)
 class Unit:
-    """Errors of the sensors: biases and noise of the gyroscope (rad/s) and the accelerometer (m/s^2), encoders (rad)."""
+    """Errors of the sensors: biases and noise of the gyroscope (rad/s) and the accelerometer (m/s^2), encoders (rad; a tenth in m)."""
 
     gyro_bias: tuple[float, float, float] = (0.02, -0.012, 0.008)
     accel_bias: tuple[float, float, float] = (0.08, -0.05, 0.1)
@@ -42,6 +42,14 @@ class Fault:
 
 
 FAULTS = {
+    "stool": {
+        "null": Fault(),
+        "coulomb": Fault("coulomb_friction", "ankle", 2.0),
+        "gain": Fault("actuator_gain", "lift", 0.75),
+        "delay": Fault("actuator_delay", "lift", 0.03),
+        "payload": Fault("payload", "trunk", 1.5),
+        "armature": Fault("armature", "lift", 3.0),
+    },
     "bars": {
         "null": Fault(),
         "coulomb": Fault("coulomb_friction", "front_knee", 1.0),
@@ -63,13 +71,12 @@ FAULTS = {
 
 def model_of(robot: str, place: str) -> str:
     """MJCF of the nominal robot: `ground` floats over a plane, `stand` hangs fixed."""
-    body = _bars() if robot == "bars" else _quadruped()
-    names, legs = body
-    kp, kv = GAINS[robot]
+    if robot == "stool":
+        return _stool(place)
+    names, legs = _bars() if robot == "bars" else _quadruped()
+    kp, kv = SERVO
     joint = '<freejoint name="root"/>' if place == "ground" else ""
-    drives = "".join(
-        f'<position name="{n}" joint="{n}" kp="{kp}" kv="{kv}" forcerange="-60 60"/>' for n in names
-    )
+    drives = "".join(f'<position name="{n}" joint="{n}" kp="{kp}" kv="{kv}" forcerange="-60 60"/>' for n in names)
     box = ("0.16 0.09 0.04", 4.0) if robot == "bars" else ("0.2 0.09 0.05", 7.0)
     return f"""<mujoco model="{robot}"><option timestep="{MODEL_STEP}"/>
 <default><joint damping="0.3" armature="0.01"/><geom contype="0" conaffinity="1" friction="1"/></default>
@@ -79,6 +86,27 @@ def model_of(robot: str, place: str) -> str:
 <site name="imu" pos="0.05 0.01 0.03" euler="0 0 90"/>{legs}</body></worldbody>
 <actuator>{drives}</actuator>
 <sensor><gyro name="imu_gyro" site="imu"/><accelerometer name="imu_accel" site="imu"/>
+<framequat name="imu_quat" objtype="site" objname="imu"/></sensor></mujoco>"""
+
+
+def _stool(place: str) -> str:
+    """A trunk over a plate on three feet, with a lift and an ankle: the smallest floating robot that moves."""
+    joint = '<freejoint name="root"/>' if place == "ground" else ""
+    feet = "".join(
+        f'<geom name="foot{i}" type="sphere" size=".02" pos="{x} {y} -.03" mass=".02"/>'
+        for i, (x, y) in enumerate(((0.16, 0.0), (-0.1, 0.13), (-0.1, -0.13)))
+    )
+    return f"""<mujoco model="stool"><option timestep="0.005" integrator="implicitfast" iterations="8" ls_iterations="8"/>
+<default><geom contype="0" conaffinity="1" friction="1"/></default>
+<worldbody><geom name="floor" type="plane" size="5 5 .1" contype="1"/>
+<body name="trunk" pos="0 0 {1.0 if place == "stand" else 0.35}">{joint}
+<geom type="box" size=".1 .08 .05" mass="4" conaffinity="0"/><site name="imu" pos="0.05 0.01 0.03" euler="0 0 90"/>
+<body name="column" pos="0 0 -.1"><joint name="lift" type="slide" axis="0 0 1" damping="30" armature="1"/>
+<geom type="capsule" size=".015" fromto="0 0 0 0 0 -.15" mass=".5" conaffinity="0"/>
+<body name="plate" pos="0 0 -.16"><joint name="ankle" axis="0 1 0" damping=".4" armature=".02"/>
+<geom type="box" size=".12 .1 .01" mass=".8" conaffinity="0"/>{feet}</body></body></body></worldbody>
+<actuator><position name="lift" joint="lift" kp="3000" kv="120"/><position name="ankle" joint="ankle" kp="150" kv="6"/>
+</actuator><sensor><gyro name="imu_gyro" site="imu"/><accelerometer name="imu_accel" site="imu"/>
 <framequat name="imu_quat" objtype="site" objname="imu"/></sensor></mujoco>"""
 
 
@@ -118,7 +146,7 @@ def with_fault(xml: str, fault: Fault) -> mujoco.MjModel:
     spec = mujoco.MjSpec.from_string(xml)
     spec.option.timestep = STEP
     if fault.effect == "coulomb_friction":
-        spec.joint(fault.where).frictionloss += fault.size
+        spec.joint(fault.where).frictionloss = fault.size
     if fault.effect == "armature":
         spec.joint(fault.where).armature += fault.size
     if fault.effect == "payload":
@@ -138,6 +166,10 @@ def with_fault(xml: str, fault: Fault) -> mujoco.MjModel:
 def targets(robot: str, place: str, seed: int, names: list[str]):  # noqa: ANN201
     """Return a function of time: targets `[nu]` rad of squats and shifts of weight, or of free legs on a stand."""
     rng = np.random.default_rng(seed)
+    if robot == "stool":
+        size = np.array([0.035, 0.07 if place == "ground" else 0.3])
+        rates, angle = 2 * np.pi * rng.uniform(0.4, 1.7, (3, 2)), rng.uniform(0, 2 * np.pi, (3, 2))
+        return lambda t: min(1.0, max(0.0, t + SETTLE - 0.3) / 0.7) * size * np.sin(rates * t + angle).sum(0) / 2
     bend, joints = 0.55, len(names)
     pace = 2 * np.pi * rng.uniform(0.35, 0.6)
     phase = rng.uniform(0, 2 * np.pi, 6)
@@ -162,7 +194,7 @@ def targets(robot: str, place: str, seed: int, names: list[str]):  # noqa: ANN20
 
 
 def run(xml: str, robot: str, place: str, fault: Fault, seed: int, seconds: float, unit: Unit) -> dict[str, np.ndarray]:
-    """One run: encoders and commands at 100 Hz, the unit at 200 Hz; without noise the truth of the base."""
+    """One run: encoders and commands at 100 Hz (stool: 50 Hz), the unit twice as fast; and the base's true motion."""
     model = with_fault(xml, fault)
     data, rng = mujoco.MjData(model), np.random.default_rng(1000 + seed)
     names = [model.actuator(i).name for i in range(model.nu)]
@@ -176,8 +208,9 @@ def run(xml: str, robot: str, place: str, fault: Fault, seed: int, seconds: floa
     slow = names.index(fault.where) if late else 0
     sent: list[np.ndarray] = []
     rows: dict[str, list] = {k: [] for k in ("time", "ctrl", "qpos", "gyro", "accel", "quat", "pose", "twist")}
-    begin, each, total = round(SETTLE / STEP), round(0.01 / STEP), round((SETTLE + seconds) / STEP)
+    begin, each, total = round(SETTLE / STEP), round((0.02 if robot == "stool" else 0.01) / STEP), round((SETTLE + seconds) / STEP)
     command = want(-SETTLE)
+    encoder = unit.encoder * np.array([0.1 if model.jnt_type[model.joint(n).id] == 2 else 1.0 for n in names])
     for k in range(total):
         if k % each == 0:
             command = want(k * STEP - SETTLE)
@@ -190,7 +223,7 @@ def run(xml: str, robot: str, place: str, fault: Fault, seed: int, seconds: floa
             whole = (k - begin) % each == 0
             rows["time"].append((k - begin) * STEP)
             rows["ctrl"].append(command if whole else np.full(len(names), np.nan))
-            noisy = data.qpos[adr] + unit.encoder * rng.normal(size=len(names))
+            noisy = data.qpos[adr] + encoder * rng.normal(size=len(names))
             rows["qpos"].append(noisy if whole else np.full(len(names), np.nan))
             seen = {n: data.sensor(f"imu_{n}").data.copy() for n in ("gyro", "accel", "quat")}
             rows["gyro"].append(seen["gyro"] + unit.gyro_bias + unit.gyro * rng.normal(size=3))
@@ -240,9 +273,9 @@ def write(out: Path, robot: str, place: str, fault: str, runs: int, seconds: flo
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--robot", choices=FAULTS, default="bars")
+    parser.add_argument("--robot", choices=FAULTS, default="stool")
     parser.add_argument("--place", choices=("ground", "stand"), default="ground")
-    parser.add_argument("--fault", choices=FAULTS["bars"], default="null")
+    parser.add_argument("--fault", choices=FAULTS["stool"], default="null")
     parser.add_argument("--runs", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=6.0)
     parser.add_argument("--orientation", action="store_true", help="the unit gives its orientation, too")

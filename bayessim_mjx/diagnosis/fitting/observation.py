@@ -23,7 +23,9 @@ from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
 from bayessim_mjx.diagnosis.fitting.scales import mass_matrix
 from bayessim_mjx.diagnosis.logcheck.drives import DeclaredLaw
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.inertial import having
 from bayessim_mjx.logs.log import Log
+from bayessim_mjx.odometry import base as odometry
 from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
@@ -57,6 +59,11 @@ def shortened(logs: Sequence[Log], seconds: float) -> tuple[tuple[Log, ...], lis
     return tuple(out), [text]
 
 
+def floats(logs: Sequence[Log], model: mujoco.MjModel) -> bool:
+    """Whether a floating base was not measured in some log, but its rates were."""
+    return any(having(log.streams, "gyro") and odometry.lost_base(log, model) for log in logs)
+
+
 def completed(logs: Sequence[Log], model: mujoco.MjModel) -> tuple[Log, ...]:
     """Complete the logs with the motion of joints that were not measured, and its standard deviations.
 
@@ -68,6 +75,8 @@ def completed(logs: Sequence[Log], model: mujoco.MjModel) -> tuple[Log, ...]:
     """
     if not any(log.lost for log in logs):
         return tuple(logs)
+    if floats(logs, model):
+        return tuple(odometry.completed(log, model)[0] if log.lost else log for log in logs)
     _demand_axial(logs)
     ways = [_smoothed(log, model) if log.lost else None for log in logs]
     _demand([(log, way) for log, way in zip(logs, ways, strict=True) if way is not None], model)
