@@ -35,7 +35,8 @@ def onto_encoders(table: Table, columns: dict[str, Array], channels: Channels) -
     """Table and columns without the rows that hold samples of inertial units alone.
 
     The unit is often faster than the encoders. The sample nearest to a row stays, for it is compared with a simulation
-    at that instant. Means over the time around the row go into further columns (`MEAN`): they keep the way between rows.
+    at that instant. Means over the time around each row go into further columns (`MEAN`): they keep the way between
+    rows.
 
     Raises:
         UserError: no row holds all commands and positions.
@@ -64,7 +65,8 @@ def onto_encoders(table: Table, columns: dict[str, Array], channels: Channels) -
         if seen.any() and name.startswith(("gyro", "accel")):
             changed[MEAN + name] = _means(*given)
     lines = [table.row(int(row)) for row in rows]
-    text = f"{table.path}: {int(alone.sum())} rows hold samples of an inertial unit alone: their means go into the {len(rows)} others"
+    text = f"{table.path}: {int(alone.sum())} rows hold samples of an inertial unit alone"
+    text = f"{text}: their means go into the {len(rows)} others"
     warnings.warn(text, stacklevel=4)
     return dataclasses.replace(table, kept=lines), changed
 

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.inertial import having
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.signals import derivative
-from bayessim_mjx.odometry import feet, imu, smoother
+from bayessim_mjx.odometry import feet, imu, smoother, stand
 from bayessim_mjx.odometry.imu import Sensor
 from bayessim_mjx.odometry.smoother import Inputs, Noise, Track
 
@@ -20,7 +22,10 @@ from bayessim_mjx.odometry.smoother import Inputs, Noise, Track
 # one is taken. Rules of thumb, not counted
 ROUGH = (1.0, 3.0, 10.0, 30.0)
 ROWS = 300  # of a log, that choose it: a choice between seconds and accuracy, not counted
-LEAST = (1e-4, 5e-3)  # rad/s and m/s^2, noise of a gyroscope and an accelerometer at least: good sensors; rules of thumb
+LEAST = (
+    1e-4,
+    5e-3,
+)  # rad/s and m/s^2, noise of a gyroscope and an accelerometer at least: good sensors; rules of thumb
 SETTLED = 0.2  # s at a log's begin, over which the first vertical is averaged; a rule of thumb
 
 
@@ -35,7 +40,7 @@ class Base:
         sd_qvel: `[T, 6]`, of velocity in the world and rate in the base's frame.
         heading: whether the heading was measured: always False.
         gyro_bias, accel_bias: `[3]`, at the middle of the log; sd_gyro_bias, sd_accel_bias: `[3]`.
-        rests: `[T]`, points that rested on the ground; sensors: that were used.
+        rests: `[T, K]`, which points rested on the ground; sensors: that were used.
         noise: rad/s, of the gyroscope's samples `[3]` in the base's frame.
     """
 
@@ -47,27 +52,17 @@ class Base:
     sd_gyro_bias: Array
     accel_bias: Array
     sd_accel_bias: Array
-    rests: Array
+    rests: NDArray[np.bool_]
     sensors: tuple[Sensor, ...]
     noise: Array
     heading: bool = False
-
-
-def lost_base(log: Log, model: mujoco.MjModel) -> str:
-    """Return the name of the free joint whose position was not measured; "" if there is none."""
-    joint = feet.base_joint(model)
-    if joint < 0:
-        return ""
-    name = log.joints[joint]
-    return name if set(log.lost) & {f"qpos:{n}" for n in log.channels.of_joint(name)} else ""
 
 
 def estimate(log: Log, model: mujoco.MjModel) -> Base:
     """Return the base's motion by gyroscope, accelerometer, orientation where given, encoders and feet.
 
     Raises:
-        UserError: no free joint, a sensor is missing or sits elsewhere, no level ground, or another joint was not
-            measured.
+        UserError: no free joint, a sensor is missing or sits elsewhere, or there is no level ground.
     """
     joint = feet.base_joint(model)
     if joint < 0:
@@ -109,7 +104,9 @@ def _on_base(log: Log, model: mujoco.MjModel, joint: int) -> dict[str, Sensor]:
     for sensor in imu.sensors(log, model):
         if sensor.kind != "touch" and sensor.body == body:
             if sensor.kind in own:
-                raise UserError(f"{source}: {own[sensor.kind].label} and {sensor.label} are both on the base; allowed: one")
+                raise UserError(
+                    f"{source}: {own[sensor.kind].label} and {sensor.label} are both on the base; allowed: one"
+                )
             own[sensor.kind] = sensor
     missing = [imu.KINDS[kind][1] for kind in ("gyro", "accel") if kind not in own]
     if missing:
@@ -141,7 +138,7 @@ def _at_base(log: Log, rate: Array, force: Array, place: Array) -> Array:
 
 
 def _verticals(log: Log, quat: Sensor | None, force: Array) -> tuple[Array | None, Array]:
-    """(directions against gravity `[T, 3]` by an orientation sensor or None, first guesses of the attitude `[T, 4]`)."""
+    """(directions against gravity `[T, 3]` by an orientation sensor or None, guesses of the attitude `[T, 4]`)."""
     if quat is not None:
         turn = np.empty(4)
         mujoco.mju_mat2Quat(turn, quat.turn.T.reshape(-1))
@@ -202,31 +199,63 @@ def _base(track: Track, inputs: Inputs, sensors: Sequence[Sensor], noise: Array)
     )
 
 
-def completed(log: Log, model: mujoco.MjModel) -> tuple[Log, Base]:
+def of_logs(logs: Sequence[Log], model: mujoco.MjModel, bases: list[Base] | None) -> tuple[Log, ...] | None:
+    """Return the logs completed by the motion of a floating base that shows in a gyroscope; None: there is none.
+
+    bases: to which the estimates are appended.
+    """
+    if not any(having(log.streams, "gyro") and feet.lost_base(log, model) for log in logs):
+        return None
+    pairs = [completed(log, model) if log.lost else (log, None) for log in logs]
+    if bases is not None:
+        bases += [found for _, found in pairs if found is not None]
+    return tuple(log for log, _ in pairs)
+
+
+def completed(log: Log, model: mujoco.MjModel) -> tuple[Log, Base | None]:
     """Return the log with the base's motion: its rates as measured by the gyroscope, the rest as guesses.
 
+    Where a weld to the world holds the base there is no motion to estimate, and none is compared.
+
     Raises:
-        UserError: see `estimate`.
+        UserError: see `estimate`; or another joint was not measured.
     """
-    name = lost_base(log, model)
+    name = feet.lost_base(log, model)
     others = [c for c in log.lost if c not in {f"qpos:{n}" for n in log.channels.of_joint(name)}]
     if others:
         raise UserError(
             f"{log.name}: {', '.join(others)} were not measured, and neither was the floating base {name!r}; allowed: "
             "logs with the positions of all joints, or of the base"
         )
+    held = stand.welded(model, int(model.jnt_bodyid[log.joints.index(name)]))
+    if held is not None:
+        pose, twist = np.tile(held, (len(log), 1)), np.zeros((len(log), 6))
+        return _with(log, name, (pose, np.full(7, stand.HOLDS)), (twist, np.full(6, stand.HOLDS)), rates=False), None
     base = estimate(log, model)
-    q, v = log.channels.columns(name), log.channels.columns(name, "qvel")
     typical = np.sqrt(np.median(base.sd_qpos**2, axis=0))
     typical[:2] = typical[2]  # nothing depends on a place on level ground: any size serves for its start
-    qpos, sigma_qpos, qvel, sigma_qvel = (np.array(x) for x in (log.qpos, log.sigma_qpos, log.qvel, log.sigma_qvel))
-    qpos[:, q], qvel[:, v] = base.qpos, base.qvel
-    sigma_qpos[q] = np.concatenate([typical[:3], np.full(4, typical[3] / 2)])  # `Log.sigma_dofs`
+    sigma = np.concatenate([typical[:3], np.full(4, typical[3] / 2)])  # `Log.sigma_dofs`
     speed = np.sqrt(np.median(base.sd_qvel**2, axis=0))
     speed[3:] = np.hypot(base.noise, speed[3:])
-    sigma_qvel[v] = speed
+    return _with(log, name, (base.qpos, sigma), (base.qvel, speed), rates=True), base
+
+
+def _with(log: Log, name: str, pose: tuple[Array, Array], twist: tuple[Array, Array], rates: bool) -> Log:
+    """Return the log with values and standard deviations of the free joint; rates: its rotation counts as measured."""
+    q, v = log.channels.columns(name), log.channels.columns(name, "qvel")
+    qpos, sigma_qpos, qvel, sigma_qvel = (np.array(x) for x in (log.qpos, log.sigma_qpos, log.qvel, log.sigma_qvel))
+    qpos[:, q], sigma_qpos[q] = pose
+    qvel[:, v], sigma_qvel[v] = twist
     unknown = [] if log.has_qvel else [f"qvel:{n}" for n in log.channels.qvel]
-    rates = {f"qvel:{n}" for n in log.channels.qvel[v][3:]}
-    absent = tuple(n for n in dict.fromkeys((*log.absent, *unknown)) if n not in rates)
-    new = dataclasses.replace(log, qpos=qpos, qvel=qvel, has_qvel=True, absent=absent, sigma_qpos=sigma_qpos, sigma_qvel=sigma_qvel)
-    return new, base
+    seen = {f"qvel:{n}" for n in log.channels.qvel[v][3:]} if rates else set()
+    absent = [n for n in dict.fromkeys((*log.absent, *unknown)) if n not in seen]
+    none = not rates and not log.has_qvel
+    return dataclasses.replace(
+        log,
+        qpos=qpos,
+        qvel=qvel,
+        has_qvel=not none,
+        absent=tuple(n for n in absent if not (none and n.startswith("qvel:"))),
+        sigma_qpos=sigma_qpos,
+        sigma_qvel=sigma_qvel,
+    )

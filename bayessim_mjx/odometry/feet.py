@@ -48,6 +48,15 @@ def base_joint(model: mujoco.MjModel) -> int:
     return int(free[0]) if len(free) == 1 else -1
 
 
+def lost_base(log: Log, model: mujoco.MjModel) -> str:
+    """Return the name of the free joint whose position was not measured; "" if there is none."""
+    joint = base_joint(model)
+    if joint < 0:
+        return ""
+    name = log.joints[joint]
+    return name if set(log.lost) & {f"qpos:{n}" for n in log.channels.of_joint(name)} else ""
+
+
 def ground(model: mujoco.MjModel) -> int:
     """Return the plane that the robot can stand on.
 
@@ -110,7 +119,9 @@ def measured(
     for sensor in (s for s in sensors if s.kind == "touch"):
         own = [i for i, g in enumerate(geoms) if model.body_weldid[model.geom_bodyid[g]] == sensor.body]
         values = np.nan_to_num(sensor.values(log)[:, 0])
-        rests[:, own] = (values > ON * np.percentile(values, LARGE))[:, None] & (heights[:, own] < heights.min(1)[:, None] + 3 * NEAR)
+        rests[:, own] = (values > ON * np.percentile(values, LARGE))[:, None] & (
+            heights[:, own] < heights.min(1)[:, None] + 3 * NEAR
+        )
     names = tuple(model.geom(g).name or f"geom{g}" for g in geoms)
     return Feet(names, point, spread, rolled, rests, level)
 

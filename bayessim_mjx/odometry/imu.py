@@ -58,14 +58,14 @@ class Sensor:
         """Return standard deviations `[n]` of the noise that the samples show, or that `sigma` of the log states."""
         stated = log.metadata.get("sigma") or {}
         levels = []
-        for column in self.columns:
-            x = log.streams[column]
-            own = stated.get(column, stated.get(self.label))
+        for name in self.columns:
+            x = log.streams[name]
+            own = stated.get(name, stated.get(self.label))
             levels.append(noise_level(x[np.isfinite(x)]) if own is None else float(own))
         return np.array(levels)
 
     def rate(self, log: Log) -> float:
-        """Samples per second."""
+        """Return the samples per second."""
         count = int(np.isfinite(log.streams[self.columns[0]]).sum())
         return (count - 1) / log.duration if log.duration > 0 else 0.0
 

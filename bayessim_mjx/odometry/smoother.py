@@ -26,7 +26,9 @@ SIZE = 15
 # ones cost float64 digits
 FIXED = 1e-4
 FREE = 1.0  # m, of a point over the ground before it was seen: as good as unknown; a rule of thumb
-OUTLIER = 16.27  # squared error of a point from which it slipped: of three Gaussian numbers 1 in 1000 exceed it; float64
+OUTLIER = (
+    16.27  # squared error of a point from which it slipped: of three Gaussian numbers 1 in 1000 exceed it; float64
+)
 
 
 @dataclass(frozen=True)
@@ -205,7 +207,7 @@ class _Filter:
         for i in np.flatnonzero(anew):
             own = slice(SIZE + 3 * i, SIZE + 3 * i + 3)
             way[own], push[own] = 0.0, 0.0
-            self._anew(new, fresh, k, i)
+            self._anew(new, fresh, k, int(i))
         spread = way @ spread @ way.T + np.diag(push**2) + fresh
         self.ways.append(way)
         self.predicted.append((new, spread))

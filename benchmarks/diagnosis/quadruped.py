@@ -22,13 +22,18 @@ SERVO = (120.0, 3.0)  # N m/rad, N m s/rad of the position servos of legs
 
 @dataclasses.dataclass(frozen=True)
 class Unit:
-    """Errors of the sensors: biases and noise of the gyroscope (rad/s) and the accelerometer (m/s^2), encoders (rad; a tenth in m)."""
+    """Errors of the sensors.
+
+    Attributes:
+        gyro_bias, gyro: bias and noise of the gyroscope, rad/s; accel_bias, accel: of the accelerometer, m/s^2.
+        tilt: rad, slow errors of the orientation; encoder: rad, a tenth of it in m.
+    """
 
     gyro_bias: tuple[float, float, float] = (0.02, -0.012, 0.008)
     accel_bias: tuple[float, float, float] = (0.08, -0.05, 0.1)
     gyro: float = 2e-3
     accel: float = 3e-2
-    tilt: float = 4e-3  # rad, slow errors of the orientation
+    tilt: float = 4e-3
     encoder: float = 3e-4
 
 
@@ -96,7 +101,8 @@ def _stool(place: str) -> str:
         f'<geom name="foot{i}" type="sphere" size=".02" pos="{x} {y} -.03" mass=".02"/>'
         for i, (x, y) in enumerate(((0.16, 0.0), (-0.1, 0.13), (-0.1, -0.13)))
     )
-    return f"""<mujoco model="stool"><option timestep="0.005" integrator="implicitfast" iterations="8" ls_iterations="8"/>
+    option = 'timestep="0.005" integrator="implicitfast" iterations="8" ls_iterations="8"'
+    return f"""<mujoco model="stool"><option {option}/>
 <default><geom contype="0" conaffinity="1" friction="1"/></default>
 <worldbody><geom name="floor" type="plane" size="5 5 .1" contype="1"/>
 <body name="trunk" pos="0 0 {1.0 if place == "stand" else 0.35}">{joint}
@@ -108,6 +114,10 @@ def _stool(place: str) -> str:
 <actuator><position name="lift" joint="lift" kp="3000" kv="120"/><position name="ankle" joint="ankle" kp="150" kv="6"/>
 </actuator><sensor><gyro name="imu_gyro" site="imu"/><accelerometer name="imu_accel" site="imu"/>
 <framequat name="imu_quat" objtype="site" objname="imu"/></sensor></mujoco>"""
+
+
+def _body(name: str, pos: str, joint: str, axis: str, inner: str) -> str:
+    return f'<body name="{name}" pos="{pos}"><joint name="{joint}" axis="{axis}"/>{inner}</body>'
 
 
 def _limb(length: float, mass: float, inner: str) -> str:
@@ -122,8 +132,8 @@ def _bars() -> tuple[list[str], str]:
             f'<geom name="{side}_{k}" type="sphere" size=".018" pos="0 {y} -.15" mass=".06"/>'
             for k, y in (("left", 0.1), ("right", -0.1))
         )
-        knee = f'<body name="{side}_shank" pos="0 0 -.15"><joint name="{side}_knee" axis="0 1 0"/>{_limb(0.15, 0.25, feet)}</body>'
-        out += f'<body name="{side}_thigh" pos="{x} 0 0"><joint name="{side}_hip" axis="0 1 0"/>{_limb(0.15, 0.4, knee)}</body>'
+        knee = _body(f"{side}_shank", "0 0 -.15", f"{side}_knee", "0 1 0", _limb(0.15, 0.25, feet))
+        out += _body(f"{side}_thigh", f"{x} 0 0", f"{side}_hip", "0 1 0", _limb(0.15, 0.4, knee))
         names += [f"{side}_hip", f"{side}_knee"]
     return names, out
 
@@ -133,10 +143,10 @@ def _quadruped() -> tuple[list[str], str]:
     names, out = [], ""
     for leg, x, y in (("FL", 0.18, 0.1), ("FR", 0.18, -0.1), ("RL", -0.18, 0.1), ("RR", -0.18, -0.1)):
         foot = f'<geom name="{leg}_foot" type="sphere" size=".02" pos="0 0 -.18" mass=".06"/>'
-        knee = f'<body name="{leg}_shank" pos="0 0 -.18"><joint name="{leg}_knee" axis="0 1 0"/>{_limb(0.18, 0.2, foot)}</body>'
-        hip = f'<body name="{leg}_thigh" pos="0 {np.sign(y) * 0.05} 0"><joint name="{leg}_hip" axis="0 1 0"/>{_limb(0.18, 0.7, knee)}</body>'
+        knee = _body(f"{leg}_shank", "0 0 -.18", f"{leg}_knee", "0 1 0", _limb(0.18, 0.2, foot))
+        hip = _body(f"{leg}_thigh", f"0 {np.sign(y) * 0.05} 0", f"{leg}_hip", "0 1 0", _limb(0.18, 0.7, knee))
         abad = f'<geom type="sphere" size=".03" mass=".5" conaffinity="0"/>{hip}'
-        out += f'<body name="{leg}_side" pos="{x} {y} 0"><joint name="{leg}_abad" axis="1 0 0"/>{abad}</body>'
+        out += _body(f"{leg}_side", f"{x} {y} 0", f"{leg}_abad", "1 0 0", abad)
         names += [f"{leg}_abad", f"{leg}_hip", f"{leg}_knee"]
     return names, out
 
@@ -208,7 +218,11 @@ def run(xml: str, robot: str, place: str, fault: Fault, seed: int, seconds: floa
     slow = names.index(fault.where) if late else 0
     sent: list[np.ndarray] = []
     rows: dict[str, list] = {k: [] for k in ("time", "ctrl", "qpos", "gyro", "accel", "quat", "pose", "twist")}
-    begin, each, total = round(SETTLE / STEP), round((0.02 if robot == "stool" else 0.01) / STEP), round((SETTLE + seconds) / STEP)
+    begin, each, total = (
+        round(SETTLE / STEP),
+        round((0.02 if robot == "stool" else 0.01) / STEP),
+        round((SETTLE + seconds) / STEP),
+    )
     command = want(-SETTLE)
     encoder = unit.encoder * np.array([0.1 if model.jnt_type[model.joint(n).id] == 2 else 1.0 for n in names])
     for k in range(total):
@@ -248,7 +262,11 @@ def write_csv(path: Path, found: dict[str, np.ndarray], orientation: bool) -> No
     head, columns = ["time"], [found["time"]]
     for label, key in kinds:
         values = found[key or label]
-        head += [f"{label}:{n}" for n in found["names"]] if key is None else [f"{label}[{i}]" for i in range(values.shape[1])]
+        head += (
+            [f"{label}:{n}" for n in found["names"]]
+            if key is None
+            else [f"{label}[{i}]" for i in range(values.shape[1])]
+        )
         columns += list(values.T)
     with path.open("w", newline="") as file:
         out = csv.writer(file)
@@ -257,7 +275,9 @@ def write_csv(path: Path, found: dict[str, np.ndarray], orientation: bool) -> No
             out.writerow(["" if np.isnan(x) else f"{x:.7g}" for x in row])
 
 
-def write(out: Path, robot: str, place: str, fault: str, runs: int, seconds: float, orientation: bool, seed: int) -> None:
+def write(
+    out: Path, robot: str, place: str, fault: str, runs: int, seconds: float, orientation: bool, seed: int
+) -> None:
     """Write `robot.xml`, `logs/run*.csv`, `truth.json` and the base's true motion `base/run*.npz`."""
     (out / "logs").mkdir(parents=True, exist_ok=True)
     (out / "base").mkdir(exist_ok=True)
