@@ -16,6 +16,8 @@ from bayessim_mjx.logs.resample import integrals
 from bayessim_mjx.logs.table import Table
 
 SIZES = {"gyro": 3, "accel": 3, "quat": 4, "touch": 1}  # numbers of each kind of column
+NAMES = {"gyro": "gyroscope", "accel": "accelerometer", "quat": "orientation", "touch": "foot contact"}
+UNITS = {"gyro": "rad/s", "accel": "m/s^2", "touch": "N"}
 MEAN = "mean:"  # before the name of a column of means around each row
 _COLUMN = re.compile(rf"({'|'.join(SIZES)})(?::([^\[\]]+))?(?:\[(\d)\])?")
 

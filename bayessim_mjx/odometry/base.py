@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs.inertial import having
+from bayessim_mjx.logs.inertial import NAMES, having
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.signals import derivative
 from bayessim_mjx.odometry import feet, imu, smoother, stand
@@ -108,7 +108,7 @@ def _on_base(log: Log, model: mujoco.MjModel, joint: int) -> dict[str, Sensor]:
                     f"{source}: {own[sensor.kind].label} and {sensor.label} are both on the base; allowed: one"
                 )
             own[sensor.kind] = sensor
-    missing = [imu.KINDS[kind][1] for kind in ("gyro", "accel") if kind not in own]
+    missing = [NAMES[kind] for kind in ("gyro", "accel") if kind not in own]
     if missing:
         name, given = log.joints[joint], ", ".join(s.label for s in own.values()) or "none"
         raise UserError(

@@ -14,12 +14,12 @@ from bayessim_mjx.logs.inertial import MEAN, SIZES, column
 from bayessim_mjx.logs.log import Array, Log, suggest
 from bayessim_mjx.logs.signals import noise_level
 
-# of each kind of column: (the model's type of sensor, its usual name)
+# the model's type of sensor of each kind of column
 KINDS = {
-    "gyro": (mujoco.mjtSensor.mjSENS_GYRO, "gyroscope"),
-    "accel": (mujoco.mjtSensor.mjSENS_ACCELEROMETER, "accelerometer"),
-    "quat": (mujoco.mjtSensor.mjSENS_FRAMEQUAT, "orientation"),
-    "touch": (mujoco.mjtSensor.mjSENS_TOUCH, "foot contact"),
+    "gyro": mujoco.mjtSensor.mjSENS_GYRO,
+    "accel": mujoco.mjtSensor.mjSENS_ACCELEROMETER,
+    "quat": mujoco.mjtSensor.mjSENS_FRAMEQUAT,
+    "touch": mujoco.mjtSensor.mjSENS_TOUCH,
 }
 _SITE, _XBODY = int(mujoco.mjtObj.mjOBJ_SITE), int(mujoco.mjtObj.mjOBJ_XBODY)
 
@@ -121,7 +121,7 @@ def _sensor(
 
 def _tag(kind: str) -> str:
     """MJCF element of the sensor."""
-    return KINDS[kind][0].name.removeprefix("mjSENS_").lower()
+    return KINDS[kind].name.removeprefix("mjSENS_").lower()
 
 
 def _no_sensor(kind: str) -> str:
@@ -132,7 +132,7 @@ def _mounted(model: mujoco.MjModel) -> dict[str, dict[str, tuple[int, int]]]:
     """{kind: {name of a sensor or of a site: (object type, its id)}}; sites named imu stand in for missing sensors."""
     out: dict[str, dict[str, tuple[int, int]]] = {}
     sites = {model.site(i).name: (_SITE, i) for i in range(model.nsite) if model.site(i).name}
-    for kind, (sort, _) in KINDS.items():
+    for kind, sort in KINDS.items():
         own = [i for i in range(model.nsensor) if int(model.sensor_type[i]) == int(sort)]
         places = [(int(model.sensor_objtype[i]), int(model.sensor_objid[i])) for i in own]
         named = {model.sensor(i).name or f"sensor{i}": place for i, place in zip(own, places, strict=True)}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.odometry import imu
 from bayessim_mjx.odometry.smoother import Noise
@@ -21,6 +22,7 @@ class Stand:
 
     Attributes:
         sensors: their names, of those on the fixed base; others: of those on moving bodies.
+        unplaced: why columns belong to no sensor of the model; "": they do.
         lean: rad, angle between the model's vertical and the accelerometer's mean; NaN: there is none.
         sd_lean: rad, by the bias that is usual of accelerometers (`Noise.accel_bias`).
         shake: rad/s, root mean square of the gyroscope beside its mean and its noise; NaN: there is none.
@@ -31,17 +33,17 @@ class Stand:
     lean: float
     sd_lean: float
     shake: float
+    unplaced: str = ""
 
 
 def measure(log: Log, model: mujoco.MjModel) -> Stand | None:
-    """Return what the log's units say of a base that does not float; None: it has none, or the base floats.
-
-    Raises:
-        UserError: a column names no sensor of the model.
-    """
-    if mujoco.mjtJoint.mjJNT_FREE in model.jnt_type or not any(map(imu.column, log.streams)):
+    """Return what the log's units say of a fixed base, and which are on other bodies; None: it has none."""
+    if not any((found := imu.column(name)) is not None and found[0] != "touch" for name in log.streams):
         return None
-    every = [s for s in imu.sensors(log, model) if s.kind != "touch"]
+    try:
+        every = [s for s in imu.sensors(log, model) if s.kind != "touch"]
+    except UserError as error:
+        return Stand((), (), np.nan, np.nan, np.nan, str(error))
     fixed = [s for s in every if s.body == 0]
     others = tuple(s.label for s in every if s.body != 0)
     lean, sd, shake = np.nan, np.nan, np.nan

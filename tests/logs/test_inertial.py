@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from bayessim_mjx import import_logs
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import read_logs
 from tests.odometry.floating import STOOL
@@ -59,3 +60,14 @@ def test_rows_without_encoders_throughout_are_refused(tmp_path, model):
     (tmp_path / "run.csv").write_text("\n".join([lines[0], *lines[2:]]))
     with pytest.raises(UserError, match="allowed: .* rows with all commands and positions"):
         read_logs(tmp_path, model, partial=True)
+
+
+def test_a_check_shows_the_unit(tmp_path, capsys):
+    text, _ = table(encoders=1)
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "run.csv").write_text(text)
+    (tmp_path / "stool.xml").write_text(STOOL)
+    code = import_logs.main(["check", str(tmp_path / "logs"), "--model", str(tmp_path / "stool.xml")])
+    shown = [line.split() for line in capsys.readouterr().out.splitlines()]
+    (gyro,) = [line for line in shown if line[:1] == ["gyro:turns[2]"]]
+    assert code == 0 and "rad/s" in gyro and gyro[-1] == "gyroscope"

@@ -155,7 +155,13 @@ def test_a_stand_that_leans_shows_in_the_accelerometer(swayed):
     text = " ".join(notes.inertial([], [found, None]))
     assert "leans by 5.7 deg" in text and "tilt the model's gravity" in text
     assert notes.inertial([], [dataclasses.replace(found, lean=0.01)])[-1].endswith("rad/s (rms)")
-    assert stand.measure(swayed[0], mujoco.MjModel.from_xml_string(STOOL)) is None
+    measured = stand.measure(swayed[0], mujoco.MjModel.from_xml_string(STOOL))
+    assert "gyro:turns: not compared, for other channels" in notes.inertial([], [measured])[0].replace(
+        "accel:pulls and ", ""
+    )
+    bare = mujoco.MjModel.from_xml_string(STOOL[: STOOL.index("<sensor>")].replace('name="imu"', "") + "</mujoco>")
+    assert "set aside: run.csv: column 'accel:pulls[0]'" in notes.inertial([], [stand.measure(log, bare)])[0]
+    assert stand.measure(dataclasses.replace(log, streams={}), fixed) is None
 
 
 @pytest.mark.parametrize(

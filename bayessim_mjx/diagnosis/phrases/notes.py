@@ -127,7 +127,8 @@ def inertial(found: Sequence[Base], stands: Sequence[Stand | None]) -> list[str]
     if fixed and lean > CLEAR * seen[0].sd_lean:
         out += ["the base leans more than an accelerometer's usual bias: tilt the model's gravity or its base"]
     if moving:
-        out += [f"{listed(moving)}: units on moving bodies are not compared, the encoders are"]
+        out += [f"{listed(moving)}: not compared, for other channels measure the motion of the bodies that carry them"]
+    out += [f"inertial units are set aside: {text}" for text in dict.fromkeys(s.unplaced for s in seen) if text]
     if not found:
         return out
     names = listed([s.label for s in found[0].sensors])
