@@ -8,13 +8,12 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.inertial import NAMES, having
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.signals import derivative
-from bayessim_mjx.odometry import feet, imu, smoother, stand
+from bayessim_mjx.odometry import feet, imu, settling, smoother, stand
 from bayessim_mjx.odometry.imu import Sensor
 from bayessim_mjx.odometry.smoother import Inputs, Noise, Track
 
@@ -40,7 +39,8 @@ class Base:
         sd_qvel: `[T, 6]`, of velocity in the world and rate in the base's frame.
         heading: whether the heading was measured: always False.
         gyro_bias, accel_bias: `[3]`, at the middle of the log; sd_gyro_bias, sd_accel_bias: `[3]`.
-        rests: `[T, K]`, which points rested on the ground; sensors: that were used.
+        points: that may touch the ground; sensors: that were used.
+        covariance: `[T, 6, 6]`, of position and orientation; x, y and heading are those since the first row.
         noise: rad/s, of the gyroscope's samples `[3]` in the base's frame.
     """
 
@@ -52,7 +52,8 @@ class Base:
     sd_gyro_bias: Array
     accel_bias: Array
     sd_accel_bias: Array
-    rests: NDArray[np.bool_]
+    points: feet.Feet
+    covariance: Array
     sensors: tuple[Sensor, ...]
     noise: Array
     heading: bool = False
@@ -193,7 +194,8 @@ def _base(track: Track, inputs: Inputs, sensors: Sequence[Sensor], noise: Array)
         sd_gyro_bias=sd[middle, smoother.BG],
         accel_bias=track.accel_bias[middle],
         sd_accel_bias=sd[middle, smoother.BA],
-        rests=inputs.feet.rests,
+        points=inputs.feet,
+        covariance=track.covariance[:, :6, :6],
         sensors=tuple(sensors),
         noise=noise,
     )
@@ -232,12 +234,16 @@ def completed(log: Log, model: mujoco.MjModel) -> tuple[Log, Base | None]:
         pose, twist = np.tile(held, (len(log), 1)), np.zeros((len(log), 6))
         return _with(log, name, (pose, np.full(7, stand.HOLDS)), (twist, np.full(6, stand.HOLDS)), rates=False), None
     base = estimate(log, model)
-    typical = np.sqrt(np.median(base.sd_qpos**2, axis=0))
-    typical[:2] = typical[2]  # nothing depends on a place on level ground: any size serves for its start
-    sigma = np.concatenate([typical[:3], np.full(4, typical[3] / 2)])  # `Log.sigma_dofs`
+    posture = np.array(log.qpos[0])
+    posture[log.channels.columns(name)] = base.qpos[0]
+    deep = settling.depth(model, posture)
+    pose, spread = settling.settled(base.qpos, base.covariance, base.points, deep)
+    sd = np.sqrt(np.median(np.diagonal(spread, axis1=1, axis2=2), axis=0))
+    tilt = float(np.sqrt(np.mean(sd[3:5] ** 2)))  # the heading's is that of the tilt: nothing depends on either
+    sigma = np.concatenate([np.full(3, sd[2]), np.full(4, tilt / 2)])  # `Log.sigma_dofs`; so does nothing on x and y
     speed = np.sqrt(np.median(base.sd_qvel**2, axis=0))
     speed[3:] = np.hypot(base.noise, speed[3:])
-    return _with(log, name, (base.qpos, sigma), (base.qvel, speed), rates=True), base
+    return _with(log, name, (pose, sigma), (base.qvel, speed), rates=True), base
 
 
 def _with(log: Log, name: str, pose: tuple[Array, Array], twist: tuple[Array, Array], rates: bool) -> Log:

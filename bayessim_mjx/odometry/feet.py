@@ -64,7 +64,7 @@ def ground(model: mujoco.MjModel) -> int:
         UserError: the model has no plane, several, or a tilted one.
     """
     planes = [g for g in range(model.ngeom) if model.geom_type[g] == int(mujoco.mjtGeom.mjGEOM_PLANE)]
-    planes = [g for g in planes if model.body_weldid[model.geom_bodyid[g]] == 0 and _touching(model, g)]
+    planes = [g for g in planes if model.body_weldid[model.geom_bodyid[g]] == 0 and touching(model, g)]
     if len(planes) != 1:
         raise UserError(
             f"the model has {len(planes) or 'no'} planes that the floating robot can touch; allowed: one level plane, "
@@ -86,7 +86,7 @@ def _placed(model: mujoco.MjModel) -> mujoco.MjData:
     return data
 
 
-def _touching(model: mujoco.MjModel, plane: int) -> list[int]:
+def touching(model: mujoco.MjModel, plane: int) -> list[int]:
     """Geoms of moving bodies that may touch it."""
     kind, kin = model.geom_contype, model.geom_conaffinity
     pairs = {(int(a), int(b)) for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)}
@@ -108,7 +108,7 @@ def measured(
         height: `[T]` m, of the base, as far as it is known; None: the lowest point rests, unless the robot falls.
     """
     plane = ground(model)
-    geoms = _touching(model, plane)
+    geoms = touching(model, plane)
     level = float(_placed(model).geom_xpos[plane][2])
     point, spread, rolled = _kinematics(model, log, attitude, geoms, plane)
     up = np.stack([_up(q) for q in attitude])

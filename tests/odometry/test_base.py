@@ -64,7 +64,7 @@ def test_a_robot_at_rest_shows_its_height_and_the_biases(model):
     assert np.abs(tilts(found.qpos[:, 3:]) - tilts(pose[:, 3:])).max() < 3 * found.sd_qpos[:, 3].max() < 0.03
     turn = next(s.turn for s in found.sensors if s.kind == "gyro")
     assert (np.abs(found.gyro_bias - turn @ BIAS) < 3 * found.sd_gyro_bias + 1e-6).all()
-    assert found.sd_gyro_bias.max() < 5e-3 and found.rests.all()
+    assert found.sd_gyro_bias.max() < 5e-3 and found.points.rests.all()
 
 
 def test_a_swaying_robot_is_followed_within_its_own_intervals(swayed):

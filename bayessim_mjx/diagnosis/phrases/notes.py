@@ -134,7 +134,7 @@ def inertial(found: Sequence[Base], stands: Sequence[Stand | None]) -> list[str]
     names = listed([s.label for s in found[0].sensors])
     tilt, height = (float(np.max([np.median(b.sd_qpos[:, i]) for b in found])) for i in (3, 2))
     spread, mean = np.max([b.sd_gyro_bias for b in found], 0), np.mean([b.gyro_bias for b in found], 0)
-    resting = float(np.mean([b.rests.any(axis=1).mean() for b in found]))
+    resting = float(np.mean([b.points.rests.any(axis=1).mean() for b in found]))
     return [
         f"the floating base was not measured: {names} and feet at rest on level ground (in {percent(resting)} of the "
         f"rows) tell its tilt (sd {extent(tilt, 'rad')}) and its height (sd {extent(height, 'm')}). Nothing tells its "
