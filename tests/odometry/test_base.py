@@ -10,7 +10,7 @@ from bayessim_mjx.diagnosis.fitting import observation
 from bayessim_mjx.diagnosis.logcheck.noise import noise_of
 from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.odometry import base, feet, imu, stand
+from bayessim_mjx.odometry import base, feet, imu, settling, stand
 from tests.odometry.floating import BIAS, STOOL, record, swaying
 
 
@@ -95,6 +95,27 @@ def test_place_and_heading_are_never_known(model, swayed):
     assert one.qpos[:, 2] == pytest.approx(other.qpos[:, 2], abs=1e-4)
     local = [np.stack([imu.rotation(q).T @ v for q, v in zip(w.qpos[:, 3:], w.qvel[:, :3], strict=True)]) for w in ways]
     assert local[0] == pytest.approx(local[1], abs=1e-3)
+
+
+def test_windows_begin_where_contacts_hold_the_base(model, swayed):
+    """Ten times nearer to the simulator's own height and tilt than what was measured tells."""
+    log, pose, _, found = swayed
+    done, _ = base.completed(log, model)
+    height, tilt = done.qpos[:, 2] - pose[:, 2], tilts(done.qpos[:, 3:7]) - tilts(pose[:, 3:])
+    assert np.sqrt(np.mean(height**2)) < 2e-4 < 0.2 * found.sd_qpos[:, 2].max()
+    assert np.sqrt(np.mean(tilt**2)) < 1e-3 < 0.2 * found.sd_qpos[:, 3].max()
+    assert (done.sigma_dofs[:6] < 2e-3).all()
+
+
+def test_the_depth_of_feet_is_that_of_a_robot_that_stands(model):
+    log, pose, _ = record(seconds=0.5)
+    stands = np.concatenate([pose[-1], log.qpos[-1, 7:]])
+    data = mujoco.MjData(model)
+    data.qpos[:] = stands
+    mujoco.mj_forward(model, data)
+    deep = np.mean([-c.dist for c in data.contact[: data.ncon]])
+    high = np.concatenate([pose[-1] + np.array([0, 0, 0.2, 0, 0, 0, 0]), log.qpos[-1, 7:]])
+    assert data.ncon == 3 and settling.depth(model, high) == pytest.approx(deep, rel=0.2)
 
 
 def test_an_orientation_sensor_narrows_the_tilt(model, swayed):
