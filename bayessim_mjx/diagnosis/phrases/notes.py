@@ -136,9 +136,9 @@ def inertial(found: Sequence[Base], stands: Sequence[Stand | None]) -> list[str]
     spread, mean = np.max([b.sd_gyro_bias for b in found], 0), np.mean([b.gyro_bias for b in found], 0)
     resting = float(np.mean([b.points.rests.any(axis=1).mean() for b in found]))
     return [
-        f"the floating base was not measured: {names} and feet at rest on level ground (in {percent(resting)} of the "
-        f"rows) tell its tilt (sd {extent(tilt, 'rad')}) and its height (sd {extent(height, 'm')}). Nothing tells its "
-        "place on the ground and its heading: they are not compared, and no effect is read from them",
+        f"the floating base was not measured. {names} and feet at rest on level ground give its tilt (sd "
+        f"{extent(tilt, 'rad')}) and height (sd {extent(height, 'm')}). Feet rest in {percent(resting)} of the rows. "
+        "Its place on the ground and its heading are unknown: they are not compared",
         f"the gyroscope's bias is {listed([estimate(m, s) for m, s in zip(mean, spread, strict=True)])} rad/s in the "
         "base's frame; its rates are compared without it. The accelerometer serves the estimate alone",
     ]
