@@ -124,7 +124,7 @@ def _demand_rest(log: Log, points: feet.Feet) -> None:
     share = float(points.rests.any(axis=1).mean())
     if share == 0.0:
         raise UserError(
-            f"{log.name}: no point of the robot rests on the ground ({', '.join(points.names)}), so the base's velocity "
+            f"{log.name}: no point of the robot rests on the ground ({', '.join(points.names)}): the base's velocity "
             "is unknown; allowed: logs of a robot that stands, or with the base's pose"
         )
 
