@@ -26,7 +26,7 @@ from bayessim_mjx.logs.proposal import hint
 from bayessim_mjx.logs.table import Table, read_npz
 from bayessim_mjx.physics import controllers
 
-LATEST = 1.0  # s by which commands may act later or earlier than their rows say
+LATEST = 1.0  # s by which commands may act, or an inertial unit may read, later or earlier than their rows say
 
 
 def read_logs(
@@ -94,9 +94,10 @@ def _read_one(
     metadata = {**hold, **log_map.metadata, **side_yaml(path), "source": str(path)}
     if metadata.get("hold", HOLDS[0]) not in HOLDS:
         raise UserError(f"{path}: hold = {metadata['hold']!r} in its side YAML; allowed: {', '.join(HOLDS)}")
-    late = metadata.get("commands_late", 0.0)
-    if not isinstance(late, int | float) or isinstance(late, bool) or not abs(late) < LATEST:
-        raise UserError(f"{path}: commands_late = {late!r}; allowed: seconds between -{LATEST:g} and {LATEST:g}")
+    for key in ("commands_late", "imu_late"):
+        late = metadata.get(key, 0.0)
+        if not isinstance(late, int | float) or isinstance(late, bool) or not abs(late) < LATEST:
+            raise UserError(f"{path}: {key} = {late!r}; allowed: seconds between -{LATEST:g} and {LATEST:g}")
     law = controllers.read(
         metadata, mj_model, channels.actuators, str(path)
     )  # refused here, before anything is simulated

@@ -71,3 +71,10 @@ def test_a_check_shows_the_unit(tmp_path, capsys):
     shown = [line.split() for line in capsys.readouterr().out.splitlines()]
     (gyro,) = [line for line in shown if line[:1] == ["gyro:turns[2]"]]
     assert code == 0 and "rad/s" in gyro and gyro[-1] == "gyroscope"
+
+
+def test_a_delay_that_is_no_number_is_refused(tmp_path, model):
+    (tmp_path / "run.csv").write_text(table(encoders=1)[0])
+    (tmp_path / "run.yaml").write_text("imu_late: soon")
+    with pytest.raises(UserError, match="imu_late = 'soon'; allowed: seconds"):
+        read_logs(tmp_path, model, partial=True)
