@@ -35,6 +35,8 @@ from bayessim_mjx.diagnosis.selection.search_state import Settings
 from bayessim_mjx.effects.support.motion import AROUND
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import resample
+from bayessim_mjx.odometry import stand
+from bayessim_mjx.odometry.base import Base
 from bayessim_mjx.physics import Physics
 
 Array = NDArray[np.float64]
@@ -91,6 +93,7 @@ class _Checked:
     Attributes:
         robot: as it is simulated beside these logs (`robot.pruned`); dt: control period, s.
         look: what the logs show before any simulation; notes: warnings so far.
+        bases: estimates of the motion of a floating base that was not measured.
     """
 
     robot: Robot
@@ -98,6 +101,7 @@ class _Checked:
     gate: gate.Gate
     look: Look
     notes: tuple[str, ...]
+    bases: tuple[Base, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +157,17 @@ def prepare(
     allowed = allows(cut.sigma_q)
     untried = [f"not tried: {text}" for text in left_out]
     few = [*notes.conditions(len(cut.groups), cut.blocks), *notes.below_noise(allowed)]
-    warnings = [*checked.notes, *timed.notes, *timed.warnings, *untried, *cut.notes, *noise.not_compared(usable), *few]
+    units = notes.inertial(checked.bases, [stand.measure(log, robot.mj_model) for log in usable])
+    warnings = [
+        *checked.notes,
+        *units,
+        *timed.notes,
+        *timed.warnings,
+        *untried,
+        *cut.notes,
+        *noise.not_compared(usable),
+        *few,
+    ]
     own = Settings(screened=24) if robot.mj_model.nv > CUTTING.many else Settings()
     settings = request.settings or (QUICK if request.quick else own)
     return Setup(
@@ -179,10 +193,11 @@ def _checked(robot: Robot, logs: Sequence[Log], request: Request, looked: Callab
     found, look = inverse_dynamics_check.checked(logs, robot, dt, said, looked)
     seconds = at_most(robot.mj_model.nv, request.quick) * (CUTTING.window + AROUND)  # that all windows hold together
     beginnings, shorter = observation.shortened(found.demand(), seconds)
-    found = found.of_logs(observation.completed(beginnings, robot.mj_model))
+    bases: list[Base] = []
+    found = found.of_logs(observation.completed(beginnings, robot.mj_model, bases))
     said += [*found.warnings, *shorter, *(f"{text} (found, not assumed)" for text in found.findings)]
     said += [] if noise.repeats(found.usable) else [noise.ONCE]
-    return _Checked(pruned(robot, found.usable, dt), dt, found, look, tuple(said))
+    return _Checked(pruned(robot, found.usable, dt), dt, found, look, tuple(said), tuple(bases))
 
 
 def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | None, budget: Budget) -> _Timed:

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs import units
+from bayessim_mjx.logs import inertial, units
 from bayessim_mjx.logs.check import needed_columns
 from bayessim_mjx.logs.csv_files import form_of
 from bayessim_mjx.logs.files import SUFFIXES, map_of_folder
@@ -212,7 +212,9 @@ def _column(
     if not channel and not note:
         note = "unused: text" if values == "text" else "unused: no channel of the map"
         if not log_map.names_channels and values != "text":
-            note = "kept as a stream"
+            unit_of = inertial.column(column)
+            note = "kept as a stream" if unit_of is None else inertial.NAMES[unit_of[0]]
+            unit = unit if unit_of is None else inertial.UNITS.get(unit_of[0], "")
     return column, channel or "-", unit, values, note
 
 

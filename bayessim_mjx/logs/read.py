@@ -17,6 +17,7 @@ from bayessim_mjx.logs.check import STREAMS, check_finite, check_motion, check_n
 from bayessim_mjx.logs.csv_files import read_csv
 from bayessim_mjx.logs.doubts import check_units, say_better_clock
 from bayessim_mjx.logs.files import FORMAT, Paths, distinct, files_of, map_of_folder, side_yaml
+from bayessim_mjx.logs.inertial import having, onto_encoders
 from bayessim_mjx.logs.jsonl import read_jsonl
 from bayessim_mjx.logs.log import HOLDS, Array, Channels, Log, suggest
 from bayessim_mjx.logs.mapping import LogMap
@@ -25,7 +26,7 @@ from bayessim_mjx.logs.proposal import hint
 from bayessim_mjx.logs.table import Table, read_npz
 from bayessim_mjx.physics import controllers
 
-LATEST = 1.0  # s by which commands may act later or earlier than their rows say
+LATEST = 1.0  # s by which commands may act, or an inertial unit may read, later or earlier than their rows say
 
 
 def read_logs(
@@ -80,6 +81,7 @@ def _read_one(
         columns, sources = log_map.apply(table), log_map.sources(table)
     else:
         columns, sources = _columns(table, channels, log_map)
+    table, columns = onto_encoders(table, columns, channels)
     columns, absent = filled(table, columns, channels, mj_model) if partial else (columns, ())
     check_names(table, columns, channels)
     table, columns = oldest_first(table, columns)
@@ -92,9 +94,10 @@ def _read_one(
     metadata = {**hold, **log_map.metadata, **side_yaml(path), "source": str(path)}
     if metadata.get("hold", HOLDS[0]) not in HOLDS:
         raise UserError(f"{path}: hold = {metadata['hold']!r} in its side YAML; allowed: {', '.join(HOLDS)}")
-    late = metadata.get("commands_late", 0.0)
-    if not isinstance(late, int | float) or isinstance(late, bool) or not abs(late) < LATEST:
-        raise UserError(f"{path}: commands_late = {late!r}; allowed: seconds between -{LATEST:g} and {LATEST:g}")
+    for key in ("commands_late", "imu_late"):
+        late = metadata.get(key, 0.0)
+        if not isinstance(late, int | float) or isinstance(late, bool) or not abs(late) < LATEST:
+            raise UserError(f"{path}: {key} = {late!r}; allowed: seconds between -{LATEST:g} and {LATEST:g}")
     law = controllers.read(
         metadata, mj_model, channels.actuators, str(path)
     )  # refused here, before anything is simulated
@@ -219,14 +222,15 @@ def filled(
     if not absent:
         return dict(columns), ()
     _known(table, channels)
-    _whole_joints(table, absent, channels)
+    _whole_joints(table, columns, absent, channels)
     if len(absent) == len(channels.qpos) and len(slow) == len(channels.qvel):
         raise UserError(
             f"{table.path}: no column qpos:<joint> or qvel:<joint>, so there is no motion to compare; it has "
             f"{', '.join(table.columns)}{hint(list(table.columns), mj_model)}"
         )
     home = dict(zip((f"qpos:{n}" for n in channels.qpos), mj_model.qpos0, strict=True))
-    blank = {name: np.full(table.rows, home.get(name, 0.0)) for name in absent}
+    rows = len(next(iter(columns.values())))
+    blank = {name: np.full(rows, home.get(name, 0.0)) for name in absent}
     positions = [name for name in absent if name.startswith("qpos:")]
     if positions:
         text = f"{table.path}: no column {', '.join(positions)}: this motion is estimated from what was measured"
@@ -243,14 +247,19 @@ def _known(table: Table, channels: Channels) -> None:
                 raise UserError(f"{table.path}: column {column}: the model has no such joint; allowed: {names}")
 
 
-def _whole_joints(table: Table, absent: list[str], channels: Channels) -> None:
-    """Several numbers of one joint (a quaternion) are measured together, and its position is measured."""
+def _whole_joints(table: Table, columns: Mapping[str, Array], absent: list[str], channels: Channels) -> None:
+    """Several numbers of one joint (a quaternion) are measured together; a base's position may show in a gyroscope."""
     for joint, kind in zip(channels.joints, channels.kinds, strict=True):
         for stream in ("qpos", "qvel"):
             own = [f"{stream}:{n}" for n in channels.of_joint(joint, stream)]
             lost = [name for name in own if name in absent]
-            needed = kind in ("free", "ball") and stream == "qpos"  # no such motion is estimated
+            inertial = kind == "free" and having(columns, "gyro")
+            needed = kind in ("free", "ball") and stream == "qpos" and not inertial  # no such motion is estimated
             if lost and (needed or len(lost) < len(own)):
                 text = f"{table.path}: missing column(s) {', '.join(lost)}"
-                none = " (only hinges and slides may be without)" if needed else ", or none"
+                none = ", or none"
+                if needed:
+                    imu = "gyro:SENSOR[0..2] and accel:SENSOR[0..2] of an inertial measurement unit on it"
+                    base = f", or {imu}" if kind == "free" else ""
+                    none = f"{base} (only hinges, slides and a floating base may be without)"
                 raise UserError(f"{text}; allowed: all {len(own)} of joint {joint!r}{none}")

@@ -24,6 +24,7 @@ from bayessim_mjx.diagnosis.fitting.scales import mass_matrix
 from bayessim_mjx.diagnosis.logcheck.drives import DeclaredLaw
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
+from bayessim_mjx.odometry import base
 from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
@@ -35,6 +36,9 @@ SIZES = (
     0.03,
     0.003,
 )  # of typical accelerations, that the model may lack: the most likely one is taken. Not counted
+
+# standard deviations of a log's first state: a radian or metre, and as much in a window; a rule of thumb
+PRIOR = (1.0, 1 / CUTTING.window)
 
 
 def shortened(logs: Sequence[Log], seconds: float) -> tuple[tuple[Log, ...], list[str]]:
@@ -57,17 +61,21 @@ def shortened(logs: Sequence[Log], seconds: float) -> tuple[tuple[Log, ...], lis
     return tuple(out), [text]
 
 
-def completed(logs: Sequence[Log], model: mujoco.MjModel) -> tuple[Log, ...]:
+def completed(logs: Sequence[Log], model: mujoco.MjModel, bases: list[base.Base] | None = None) -> tuple[Log, ...]:
     """Complete the logs with the motion of joints that were not measured, and its standard deviations.
 
     Args:
         model: as it was delivered.
+        bases: to which the motion of a floating base that was estimated is appended, of each log.
 
     Raises:
         UserError: what was measured does not tell the state of a joint.
     """
     if not any(log.lost for log in logs):
         return tuple(logs)
+    floating = base.of_logs(logs, model, bases)
+    if floating is not None:
+        return floating
     _demand_axial(logs)
     ways = [_smoothed(log, model) if log.lost else None for log in logs]
     _demand([(log, way) for log, way in zip(logs, ways, strict=True) if way is not None], model)
@@ -149,7 +157,7 @@ class _Filter:
         nv = stepper.nv
         seen = np.concatenate([log.seen_dofs, log.seen_dofs | log.seen_speeds])
         noise = np.maximum(np.concatenate([log.sigma_dofs, log.sigma_qvel]), NUDGE)
-        self.prior = np.where(seen, np.minimum(3 * noise, _prior(nv)), _prior(nv))
+        self.prior = np.where(seen, np.minimum(3 * noise, np.repeat(PRIOR, nv)), np.repeat(PRIOR, nv))
         self._run(stepper.closed(log.qpos[0], seen[:nv]), np.where(seen[nv:], log.qvel[0], 0.0))
         qpos, qvel, _ = self._back()
         self._run(qpos[0], qvel[0])  # from the smoothed start: it is linearised there
@@ -203,11 +211,6 @@ class _Filter:
         return np.stack(positions), np.stack(velocities), np.stack(spreads)
 
 
-def _prior(nv: int) -> Array:
-    """Return standard deviations `[2 nv]` of a log's first state: a radian or metre, and as much in a window."""
-    return np.repeat([1.0, 1 / CUTTING.window], nv)
-
-
 def _gained(ways: Sequence[Array], held: Sequence[Array], measured: _Measured, period: float) -> Array:
     """Return `[2 nv]`, what a window without unknown forces tells of its start state, in what was known before.
 
@@ -215,7 +218,7 @@ def _gained(ways: Sequence[Array], held: Sequence[Array], measured: _Measured, p
         held: of each row the constraints `[m, 2 nv]`, over their standard deviations.
     """
     size = len(ways[0])
-    prior = _prior(size // 2)
+    prior = np.repeat(PRIOR, size // 2)
     length = int(np.clip(round(CUTTING.window / period), 2, len(ways)))
     gained = []
     for first in np.linspace(0, len(ways) - length, 5).astype(int):

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+import numpy as np
+
 from bayessim_mjx.diagnosis.phrases.effects import CLEAR
 from bayessim_mjx.diagnosis.request import Tolerance
-from bayessim_mjx.quantities import EXACT, MOST, extent, finite, listed
+from bayessim_mjx.odometry.base import Base
+from bayessim_mjx.odometry.stand import Stand
+from bayessim_mjx.quantities import EXACT, MOST, estimate, extent, finite, listed, number, percent
 
 STAGES = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
 
@@ -86,13 +90,15 @@ def whole_logs(
     """
     out = []
     if chaotic:
+        which = f"{len(chaotic)} of {len(names)} logs ({listed(chaotic, most=MOST)})"
         used = f"they count up to there, {seconds:.2g} s at most" if kept else "they are not counted"
         out.append(
-            f"unstable or chaotic motion: in {_some(chaotic, names)} the uncertain start alone exceeds the tolerance. "
+            f"unstable or chaotic motion: in {which} the uncertain start alone exceeds the tolerance. "
             f"No simulator can predict them whole: {used}"
         )
     if broken:
-        out.append(f"simulated open loop, {_some(broken, names)} diverge: whole logs are compared without them")
+        which = f"{len(broken)} of {len(names)} logs ({listed(broken, most=MOST)})"
+        out.append(f"simulated open loop, {which} diverge: whole logs are compared without them")
     lost = [f"{STAGES[stage]} in {count} of {kept}" for stage, count in away.items() if count]
     if lost:
         text = "over whole logs the simulator leaves the measured motion"
@@ -103,5 +109,36 @@ def whole_logs(
     return out
 
 
-def _some(few: Sequence[str], names: Sequence[str]) -> str:
-    return f"{len(few)} of {len(names)} logs ({listed(few, most=MOST)})"
+def inertial(found: Sequence[Base], stands: Sequence[Stand | None]) -> list[str]:
+    """Say how well the motion of a floating base was estimated, or what inertial units show of a fixed one.
+
+    Args:
+        found: the estimates; stands: of each log, None where there is no unit or the base floats.
+    """
+    seen = [stand for stand in stands if stand is not None]
+    fixed, moving = (list(dict.fromkeys(n for s in seen for n in getattr(s, key))) for key in ("sensors", "others"))
+    lean, shake = (max((x for s in seen if finite(x := getattr(s, k))), default=0.0) for k in ("lean", "shake"))
+    out = []
+    if fixed:
+        out += [
+            f"{listed(fixed)}: the base is fixed in the model, so they are not compared. The base leans by "
+            f"{extent(lean, 'rad')} from the model's vertical and turns by {number(shake)} rad/s (rms)"
+        ]
+    if fixed and lean > CLEAR * seen[0].sd_lean:
+        out += ["the base leans more than an accelerometer's usual bias: tilt the model's gravity or its base"]
+    if moving:
+        out += [f"{listed(moving)}: not compared, for other channels measure the motion of the bodies that carry them"]
+    out += [f"inertial units are set aside: {text}" for text in dict.fromkeys(s.unplaced for s in seen) if text]
+    if not found:
+        return out
+    names = listed([s.label for s in found[0].sensors])
+    tilt, height = (float(np.max([np.median(b.sd_qpos[:, i]) for b in found])) for i in (3, 2))
+    spread, mean = np.max([b.sd_gyro_bias for b in found], 0), np.mean([b.gyro_bias for b in found], 0)
+    resting = float(np.mean([b.points.rests.any(axis=1).mean() for b in found]))
+    return [
+        f"the floating base was not measured. {names} and feet at rest on level ground give its tilt (sd "
+        f"{extent(tilt, 'rad')}) and height (sd {extent(height, 'm')}). Feet rest in {percent(resting)} of the rows. "
+        "Its place on the ground and its heading are unknown: they are not compared",
+        f"the gyroscope's bias is {listed([estimate(m, s) for m, s in zip(mean, spread, strict=True)])} rad/s in the "
+        "base's frame; its rates are compared without it. The accelerometer serves the estimate alone",
+    ]

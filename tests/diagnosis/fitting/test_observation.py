@@ -104,7 +104,7 @@ def test_a_ball_or_free_joint_has_to_be_measured(tmp_path, kind, last):
         observation.completed([part], model)
     write_log(tmp_path / "run.csv", part)
     with pytest.raises(
-        UserError, match=rf"run\.csv: missing.* qpos:hip\[{last}\]; allowed: all {last + 1} of .*'hip' \(only"
+        UserError, match=rf"run\.csv: missing.* qpos:hip\[{last}\]; allowed: all {last + 1} of .*'hip'.* \(only"
     ):
         read_logs(tmp_path, model, partial=True)
 
