@@ -20,7 +20,7 @@ import numpy as np
 from bayessim_mjx import versions
 from bayessim_mjx.env import Env, Task
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import recurrent
+from bayessim_mjx.rl import meaning, normalise, recurrent
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.onnx_graph import Graph, network
 
@@ -99,9 +99,27 @@ def metadata(policy: Policy, env: Env) -> dict[str, Any]:
         "versions": versions.of(PACKAGES),
         "golden_action": np.asarray(answer(policy, golden)).tolist(),
         **{f"golden_{name}": np.asarray(x).tolist() for name, x in golden.items()},
+        **_contract(policy, env),
     }
     if scaling is not None:
         facts |= {"action_scale": scaling[0].tolist(), "action_offset": scaling[1].tolist()}
+    return facts
+
+
+def _contract(policy: Policy, env: Env) -> dict[str, Any]:
+    """Describe what `policy check` compares: meaning of each observation, limits, normaliser, ranges of commands."""
+    names, meant = list(getattr(env, "observation_names", ())), meaning.of_task(env)
+    limit = getattr(env, "observation_clip", {}).get(getattr(env, "variant", ""))
+    limited, span = env.mj_model.actuator_ctrllimited.astype(bool), env.mj_model.actuator_ctrlrange
+    facts: dict[str, Any] = {
+        "observation_clip": limit,
+        "command_range": [list(map(float, r)) if own else None for own, r in zip(limited, span, strict=True)],
+    }
+    if meant is not None and len(meant) == len(names):
+        facts["observation_meaning"] = meant
+    if policy.normalize:
+        spread = np.sqrt(np.asarray(policy.normalizer.var)) + normalise.EPSILON
+        facts |= {"normaliser_mean": np.asarray(policy.normalizer.mean).tolist(), "normaliser_std": spread.tolist()}
     return facts
 
 
