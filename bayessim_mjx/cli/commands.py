@@ -60,6 +60,12 @@ COMMANDS = {
         "evaluate, film or export a saved policy",
         ("--task Pendulum --checkpoint best --video", "--task Pendulum --use_pretrained_checkpoint --video"),
     ),
+    "policy": Command(
+        POLICIES,
+        "compare a deployed policy with the file that was exported",
+        ("check policy.onnx --logs LOGS", "check policy.onnx --logs LOGS --golden robot.json"),
+        "policy_check",
+    ),
     "calibrate": Command(
         CHECKS,
         "test whether the posterior of a finished run can be trusted",

@@ -1,0 +1,257 @@
+"""Observations against the manifest, group by group: entries of one kind of source are compared together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayessim_mjx.contract import amounts, axes
+from bayessim_mjx.contract.evidence import Evidence, Finding, Result
+from bayessim_mjx.contract.manifest import Entry
+from bayessim_mjx.contract.relate import DELAYS, TOLD, Relation, relate, unexplained
+from bayessim_mjx.contract.state import FRAMES, VECTORS
+
+Array = NDArray[np.float64]
+MOST = 0.8  # of the entries have to follow a rule that is meant for all; a rule of thumb
+SAME = 0.02  # by which two numbers of one finding may differ, relatively; a rule of thumb
+OTHER = 0.1  # share of variance that another source may leave to be named; a rule of thumb
+CLEAR = 5.0  # times its noise: motion that has to show in what follows from it; a rule of thumb
+
+
+def groups(entries: Sequence[Entry]) -> list[list[int]]:
+    """Indices of entries that may be mistaken for each other: of one kind; of vectors, one joint."""
+    found: dict[str, list[int]] = {}
+    for i, entry in enumerate(entries):
+        if not entry.terms:
+            continue
+        joint = entry.source.partition(":")[2].rpartition(".")[0]
+        vector = entry.kind in (*VECTORS, "quaternion", "position")
+        key = f"{entry.kind}:{joint}" if vector else entry.kind or entry.name
+        key = "angle" if entry.kind in ("sin", "cos") else key
+        found.setdefault(key, []).append(i)
+    return list(found.values())
+
+
+def compare(evidence: Evidence, result: Result) -> bool:
+    """Compare all observations; whether the logged ones have been normalised before the policy."""
+    entries, seen = evidence.manifest.observations, evidence.seen
+    normalised = _normalised(evidence)
+    if normalised:
+        mean, std = evidence.manifest.mean, evidence.manifest.std
+        assert mean is not None and std is not None
+        seen = seen * std + mean
+    clip = evidence.manifest.observation_clip
+    for i, entry in enumerate(entries):
+        if not entry.terms:
+            result.untold[entry.name] = "unknown"
+        elif not np.isfinite(seen[:, i]).any():
+            result.untold[entry.name] = "not_logged"
+    shared: list[tuple[list[int], Relation]] = []
+    for members in groups(entries):
+        own = [i for i in members if np.isfinite(seen[:, i]).any()]
+        if own:
+            relation = _group(evidence, result, [entries[i] for i in own], seen[:, own], clip)
+            if relation is not None and relation.told.any():
+                shared.append((own, relation))
+    _of_all(result, entries, shared)
+    return normalised
+
+
+def _group(evidence: Evidence, result: Result, entries: list[Entry], seen: Array, clip: float) -> Relation | None:
+    kind = entries[0].kind
+    if kind == "quaternion":
+        seen = axes.continuous(seen, [len(run.time) for run in evidence.runs])
+    reference = evidence.reference(entries)
+    delays = [d for d in DELAYS if d >= 0] if kind == "action" else DELAYS
+    if kind == "task":
+        delays = [0]
+    limited = np.where(np.abs(seen) < clip, seen, np.nan) if np.isfinite(clip) else seen
+    limited = limited if np.isfinite(limited).all(1).any() else seen
+    relation = relate(limited, reference, FRAMES if kind in VECTORS else (), delays)
+    if kind == "action":
+        relation, reference = _fed_back(evidence, entries, limited, relation, delays, reference)
+    if relation is None:
+        result.untold |= {entry.name: "no_source" for entry in entries}
+        return None
+    plain = reference("", 0)
+    assert plain is not None
+    before = float(np.mean(_left(seen, plain)))
+    found = axes.findings(entries, seen, relation)
+    found += judge("observation", entries, limited, relation, axes.turned(relation), result)
+    found += _others(evidence, entries, limited, relation, result)
+    left = float(np.mean(relation.left))
+    result.findings += [replace(f, left=left, before=before) for f in axes.merged(entries, seen, found, relation)]
+    bad = {name for f in found for name in f.entries}
+    right = [e.name for e, told in zip(entries, relation.told, strict=True) if told and e.name not in bad]
+    result.compared.setdefault("observation", []).extend(right)
+    return relation
+
+
+def _fed_back(evidence, entries, seen, relation, delays, reference):  # type: ignore[no-untyped-def]
+    """Try the file's own answers as previous actions, where what was logged does not explain them."""
+    if relation is not None and relation.told.all() and float(np.mean(relation.left)) < OTHER:
+        return relation, reference
+    other = evidence.reference(entries, evidence.answers)
+    second = relate(seen, other, (), delays)
+    if second is None or (relation is not None and np.mean(second.left) > 0.5 * np.mean(relation.left)):
+        return relation, reference
+    return second, other
+
+
+def _left(seen: Array, expected: Array) -> Array:
+    rows = np.isfinite(seen).all(1) & np.isfinite(expected).all(1)
+    return np.diag(unexplained(seen[rows], expected[rows])) if rows.sum() > 2 else np.ones(seen.shape[1])
+
+
+def judge(
+    part: str, entries: Sequence[Entry], seen: Array, relation: Relation, quiet: Sequence[str], result: Result
+) -> list[Finding]:
+    """Findings of sign, unit, scale and offset, each with all entries that share it.
+
+    Args:
+        quiet: kinds that another finding of the group explains.
+    """
+    faults: list[tuple[str, amounts.Fault]] = []
+    for i, entry in enumerate(entries):
+        own, source = seen[:, i], relation.expected[:, i]
+        rows = np.isfinite(own) & np.isfinite(source)
+        if rows.sum() < 3:
+            result.untold[entry.name] = "no_source"
+            continue
+        other = entries[relation.order[i]]
+        base = (source - other.offset) / other.weight
+        if relation.told[i] and relation.turn is None:
+            slope_faults, slope = amounts.named(amounts.line(own, base), entry.weight, entry.unit, [other.weight])
+            start, sd = amounts.starting(own, base, slope)
+            offsets = [other.offset] if other is not entry else []
+            found = [*slope_faults, *amounts.start_fault(start, sd, slope, entry.weight, entry.offset, entry.unit, offsets)]
+        elif relation.turn is None:
+            found = _still(entry, own[rows], base[rows], result)
+        else:
+            found = []
+        faults += [(entry.name, fault) for fault in found if fault.kind not in quiet]
+    return _together(part, faults)
+
+
+def _still(entry: Entry, own: Array, base: Array, result: Result) -> list[amounts.Fault]:
+    """Faults of an entry whose source does not move, or that does not move with it."""
+    expected = entry.weight * base + entry.offset
+    limit = amounts.OFFSETS.get(entry.unit, amounts.OFFSET) * abs(entry.weight)
+    moves = float(np.std(expected)) > limit
+    if np.ptp(own) <= 1e-9 * max(1.0, abs(float(own[0]))) and moves:
+        return [amounts.Fault("frozen", float(own[0]), "")]
+    if moves and _clear(own) and _clear(expected):
+        return [amounts.Fault("unrelated", "", "")]
+    result.untold[entry.name] = "still" if not moves else "noise"
+    if entry.kind == "action":
+        return []
+    noise = 5 * float(np.hypot(own.std(), expected.std()) / np.sqrt(max(len(own) / 10, 1)))
+    limit += noise
+    here, there = float(np.mean(own)), float(np.mean(expected))
+    if abs(here - there) <= limit or moves:
+        return []
+    if abs(here + there) <= limit and abs(there) > 2 * limit:
+        return [amounts.Fault("sign", -1.0, 1.0)]
+    if abs(here - (there - entry.offset)) <= limit and abs(entry.offset) > 2 * limit:
+        return [amounts.Fault("pose_missing", here, there)]
+    for other, factor in amounts.UNITS.get(entry.unit, {}).items():
+        if abs(there) > 2 * limit and abs(here / (factor * there) - 1) < amounts.NEAR:
+            return [amounts.Fault("unit", other, entry.unit)]
+    return [amounts.Fault("offset", (here - there) / entry.weight, 0.0)]
+
+
+def _clear(values: Array) -> bool:
+    """Whether the motion stands far out of the noise of the channel."""
+    bend = values[2:] - 2 * values[1:-1] + values[:-2]
+    noise = float(np.median(np.abs(bend))) / (0.6745 * np.sqrt(6.0))  # of white noise: sd of its second difference
+    return float(np.std(values)) > CLEAR * noise
+
+
+def _others(
+    evidence: Evidence, entries: Sequence[Entry], seen: Array, relation: Relation, result: Result
+) -> list[Finding]:
+    """Entries that follow from none of their group: another source of the manifest that explains them."""
+    names = {f.entries[0] for f in _unrelated(entries, seen, relation)}
+    found = []
+    for i, entry in enumerate(entries):
+        if entry.name not in names:
+            continue
+        for other in evidence.manifest.observations:
+            values = evidence.reference([other])("", 0) if other.terms and other.name != entry.name else None
+            if values is not None and _left(seen[:, [i]], values)[0] < OTHER:
+                found.append(Finding("observation", "other_source", (entry.name,), other.name, entry.name))
+                break
+    return found
+
+
+def _unrelated(entries: Sequence[Entry], seen: Array, relation: Relation) -> list[Finding]:
+    rows = np.isfinite(seen).all(1) & np.isfinite(relation.expected).all(1)
+    return [
+        Finding("observation", "unrelated", (entry.name,))
+        for i, entry in enumerate(entries)
+        if not relation.told[i] and np.std(seen[rows, i]) > 1e-9 and np.std(relation.expected[rows, i]) > 1e-9
+    ]
+
+
+def _together(part: str, faults: Sequence[tuple[str, amounts.Fault]]) -> list[Finding]:
+    """One finding for all entries with the same fault."""
+    found: list[Finding] = []
+    for name, fault in faults:
+        for k, other in enumerate(found):
+            if other.kind == fault.kind and _alike(other, fault):
+                found[k] = replace(other, entries=(*other.entries, name))
+                break
+        else:
+            found.append(Finding(part, fault.kind, (name,), fault.found, fault.expected))
+    return found
+
+
+def _alike(one: Finding, two: amounts.Fault) -> bool:
+    if one.kind.startswith("pose") or one.kind == "frozen":
+        return True
+    if isinstance(one.found, float) and isinstance(two.found, float):
+        ratio = [abs(float(a)) / max(abs(float(b)), 1e-9) for a, b in ((one.found, one.expected or 1.0), (two.found, two.expected or 1.0))]
+        return abs(ratio[0] - ratio[1]) <= SAME * max(ratio[0], 1e-9) * 2
+    return one.found == two.found and one.expected == two.expected
+
+
+def _of_all(result: Result, entries: Sequence[Entry], shared: Sequence[tuple[list[int], Relation]]) -> None:
+    """Delays, held and filtered values: of the whole observation where all groups share them, else of a group."""
+    for kind, of, default in (
+        ("held", lambda r: float(r.held) if r.held > 1 else None, None),
+        ("stale", lambda r: round(r.stale, 2) if r.stale and r.held == 1 else None, None),
+        ("smooth", lambda r: round(r.smooth, 2) if r.smooth < 1 else None, None),
+        ("delay", lambda r: float(r.delay) if r.delay else None, None),
+    ):
+        values = [(members, of(relation), relation) for members, relation in shared if entries[members[0]].kind != "task"]
+        given = [v for _, v, _ in values if v is not None]
+        if not given:
+            continue
+        if len(given) == len(values) and max(given) - min(given) <= (0.1 if kind in ("stale", "smooth") else 0):
+            result.findings.append(Finding("observation", kind, (), float(np.median(given)), default))
+            continue
+        for members, value, relation in values:
+            if value is not None:
+                names = tuple(entries[i].name for i in members)
+                result.findings.append(Finding("observation", kind, names, value, default, float(relation.left.mean())))
+
+
+def _normalised(evidence: Evidence) -> bool:
+    """Whether the logged observations are those of the manifest after its normaliser."""
+    manifest = evidence.manifest
+    if manifest.mean is None or manifest.std is None:
+        return False
+    right, through = [], []
+    for i, entry in enumerate(manifest.observations):
+        expected = evidence.reference([entry])("", 0) if entry.terms else None
+        if expected is None or _left(evidence.seen[:, [i]], expected)[0] > TOLD:
+            continue
+        found = amounts.line(evidence.seen[:, i], expected[:, 0])
+        start, sd = amounts.starting(evidence.seen[:, i], expected[:, 0], 1 / manifest.std[i])
+        near = abs(start + manifest.mean[i] / manifest.std[i]) <= amounts.OFFSET / manifest.std[i] + 5 * sd
+        right.append(amounts.fits(found, 1.0))
+        through.append(amounts.fits(found, 1 / manifest.std[i]) and near)
+    return len(through) > 1 and np.mean(through) >= MOST and np.mean(right) < MOST
