@@ -33,7 +33,8 @@ def golden(evidence: Evidence, result: Result, pairs: dict[str, Array] | None) -
         observation = given["observation"]
         memory = given.get("memory", np.zeros((len(observation), evidence.network.memory)))
         error = np.abs(evidence.network.answers(observation, memory) - given["action"])
-        if error.max() > EXACT:
+        # files of older versions have golden observations beyond the limit to which they clip: a few rows differ
+        if np.mean(error.max(1) > EXACT) > 0.5:
             names = tuple(n for n, e in zip(evidence.manifest.actions, error.max(0), strict=True) if e > EXACT)
             result.findings.append(Finding("file", f"golden_{part}", names, float(error.max()), EXACT))
         else:
@@ -116,7 +117,7 @@ def _against(evidence: Evidence, result: Result, seen: Array, answers: list[Arra
     capped = _within(seen, whole, limit)
     relation = relate(capped, lambda frame, d: None if frame else np.concatenate([shifted(a, d) for a in answers]), ())
     noisy = _noise(seen, whole, limit)
-    if relation is None or float(np.mean(relation.left)) > 0.5 and noisy == 0:
+    if relation is None or (float(np.mean(relation.left)) > CLOSE and noisy == 0):
         result.findings.append(Finding("action", "other_policy", (), None, None, _left(seen, whole, limit)))
         return
     plain = relation.delay == 0 and relation.smooth == 1.0 and relation.order == tuple(range(len(names)))
@@ -126,8 +127,6 @@ def _against(evidence: Evidence, result: Result, seen: Array, answers: list[Arra
     found = [replace(f, part="action") for f in of_order(entries, capped, relation) if f.kind == "order"]
     found += [replace(f, part="action") for f in judge("action", entries, capped, relation, (), result)]
     found += _timing("action", relation)
-    if not found and float(np.mean(relation.left)) > CLOSE:
-        found = [Finding("action", "other_policy", (), None, None, float(np.mean(relation.left)))]
     result.findings += [replace(f, left=float(np.mean(relation.left))) for f in found]
     _limits(result, seen, whole, names, evidence)
 

@@ -18,6 +18,7 @@ UNITS = {  # {unit of the source: {other unit: how many of it one is}}
     "1": {"m/s^2": 9.80665},
 }
 OFFSETS = {"rad/s": 0.15, "m/s": 0.15}  # of a source: offsets that estimators of speed have; a rule of thumb
+POSES = {"pose_missing": 0.0, "pose_twice": 2.0, "pose_added": -1.0}  # times the pose in the constant part
 OFFSET = 0.03  # rad, m or 1: offsets of encoders and mounts that a policy does not feel; a rule of thumb
 
 
@@ -111,8 +112,13 @@ def start_fault(
     if min(abs(start - value) for value in right) <= limit:
         return []
     pose = abs(offset) * max(1.0, abs(ratio)) > 2 * limit
-    choices = {"pose_missing": (0.0,), "pose_twice": (2 * offset, 2 * ratio * offset), "pose_added": (-offset, -ratio * offset)}
-    for kind, values in choices.items():
-        if pose and min(abs(start - value) for value in values) <= limit:
+    for kind in POSES:
+        if pose and pose_fits(kind, start, sd, slope, weight, offset, unit):
             return [Fault(kind, start, offset)]
     return [Fault("offset", (start - offset * ratio) / slope, 0.0)]
+
+
+def pose_fits(kind: str, start: float, sd: float, slope: float, weight: float, offset: float, unit: str) -> bool:
+    """Whether a constant part is that of a default pose that is missing, counted twice or added; see `start_fault`."""
+    limit = OFFSETS.get(unit, OFFSET) * abs(slope) + 5 * sd
+    return min(abs(start - POSES[kind] * value) for value in (offset, slope / weight * offset)) <= limit

@@ -40,26 +40,13 @@ def findings(entries: Sequence[Entry], seen: Array, relation: Relation) -> list[
         found.append(Finding("observation", "axes", names, _angle(relation.turn), ""))
         return found
     moved = [i for i, j in enumerate(relation.order) if i != j]
-    for cycle in _cycles(relation.order):
-        shown = ", ".join(entries[relation.order[i]].name for i in cycle)
-        found.append(Finding("observation", "order", tuple(entries[i].name for i in cycle), shown, ""))
+    if moved:
+        shown = ", ".join(entries[relation.order[i]].name for i in moved)
+        found.append(Finding("observation", "order", tuple(entries[i].name for i in moved), shown, ""))
     if entries[0].kind == "quaternion" and len(moved) == 4:
         kinds = "".join(entries[j].source[-1] for j in relation.order)
         own = "".join(entry.source[-1] for entry in entries)
         return [Finding("observation", "quaternion_order", names, kinds, own)]
-    return found
-
-
-def _cycles(order: Sequence[int]) -> list[list[int]]:
-    found, visited = [], set()
-    for start in range(len(order)):
-        cycle = []
-        while start not in visited:
-            visited.add(start)
-            cycle.append(start)
-            start = order[start]
-        if len(cycle) > 1:
-            found.append(sorted(cycle))
     return found
 
 

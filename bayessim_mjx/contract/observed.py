@@ -68,8 +68,8 @@ def _group(evidence: Evidence, result: Result, entries: list[Entry], seen: Array
     delays = [d for d in DELAYS if d >= 0] if kind == "action" else DELAYS
     if kind == "task":
         delays = [0]
-    limited = np.where(np.abs(seen) < clip, seen, np.nan) if np.isfinite(clip) else seen
-    limited = limited if np.isfinite(limited).all(1).any() else seen
+    # a log may be written before the clip or after it
+    limited = np.where(np.abs(np.abs(seen) - clip) > 1e-6, seen, np.nan) if np.isfinite(clip) else seen
     relation = relate(limited, reference, FRAMES if kind in VECTORS else (), delays)
     if kind == "action":
         relation, reference = _fed_back(evidence, entries, limited, relation, delays, reference)
@@ -81,6 +81,8 @@ def _group(evidence: Evidence, result: Result, entries: list[Entry], seen: Array
     before = float(np.mean(_left(seen, plain)))
     found = axes.findings(entries, seen, relation)
     found += judge("observation", entries, limited, relation, axes.turned(relation), result)
+    if kind == "action" and any(f.kind in ("scale", "offset") for f in found) and _commands_back(evidence, seen, entries):
+        found = [Finding("observation", "command_fed_back", tuple(e.name for e in entries))]
     found += _others(evidence, entries, limited, relation, result)
     left = float(np.mean(relation.left))
     result.findings += [replace(f, left=left, before=before) for f in axes.merged(entries, seen, found, relation)]
@@ -101,6 +103,18 @@ def _fed_back(evidence, entries, seen, relation, delays, reference):  # type: ig
     return second, other
 
 
+def _commands_back(evidence: Evidence, seen: Array, entries: Sequence[Entry]) -> bool:
+    """Whether the previous commands are fed back, in place of the actions."""
+    if not evidence.has("ctrl"):
+        return False
+    expected = evidence.reference(entries, [run.ctrl for run in evidence.runs])("", 0)
+    if expected is None:
+        return False
+    rows = np.isfinite(seen).all(1) & np.isfinite(expected).all(1)
+    rest = np.mean((seen[rows] - expected[rows]) ** 2) if rows.any() else np.inf
+    return bool(rest < OTHER * np.mean(np.var(seen[rows], axis=0)))
+
+
 def _left(seen: Array, expected: Array) -> Array:
     rows = np.isfinite(seen).all(1) & np.isfinite(expected).all(1)
     return np.diag(unexplained(seen[rows], expected[rows])) if rows.sum() > 2 else np.ones(seen.shape[1])
@@ -115,6 +129,7 @@ def judge(
         quiet: kinds that another finding of the group explains.
     """
     faults: list[tuple[str, amounts.Fault]] = []
+    lines: dict[str, tuple[Entry, float, float, float]] = {}
     for i, entry in enumerate(entries):
         own, source = seen[:, i], relation.expected[:, i]
         rows = np.isfinite(own) & np.isfinite(source)
@@ -127,13 +142,33 @@ def judge(
             slope_faults, slope = amounts.named(amounts.line(own, base), entry.weight, entry.unit, [other.weight])
             start, sd = amounts.starting(own, base, slope)
             offsets = [other.offset] if other is not entry else []
+            lines[entry.name] = (entry, start, sd, slope)
             found = [*slope_faults, *amounts.start_fault(start, sd, slope, entry.weight, entry.offset, entry.unit, offsets)]
         elif relation.turn is None:
             found = _still(entry, own[rows], base[rows], result)
         else:
             found = []
         faults += [(entry.name, fault) for fault in found if fault.kind not in quiet]
-    return _together(part, faults)
+    return _together(part, _poses(faults, lines))
+
+
+def _poses(
+    faults: list[tuple[str, amounts.Fault]], lines: dict[str, tuple[Entry, float, float, float]]
+) -> list[tuple[str, amounts.Fault]]:
+    """Let a default pose that is wrong in some entries hold for others too, whose own pose is too small to show it."""
+    kinds = {fault.kind for _, fault in faults if fault.kind.startswith("pose")}
+    out = [(name, fault) for name, fault in faults if fault.kind != "offset" or not kinds]
+    for name, (entry, start, sd, slope) in lines.items() if kinds else ():
+        own = [fault for of, fault in faults if of == name]
+        if any(fault.kind.startswith("pose") for fault in own):
+            continue
+        for kind in sorted(kinds):
+            if entry.offset and amounts.pose_fits(kind, start, sd, slope, entry.weight, entry.offset, entry.unit):
+                out.append((name, amounts.Fault(kind, start, entry.offset)))
+                break
+        else:
+            out += [(name, fault) for fault in own if fault.kind == "offset"]
+    return out
 
 
 def _still(entry: Entry, own: Array, base: Array, result: Result) -> list[amounts.Fault]:

@@ -88,7 +88,7 @@ def relate(seen: Array, reference: Reference, frames: Sequence[str], delays: Seq
         assert first is not None
         smooth = _filtered(seen, first[:, order], left)
         if smooth < 1.0:
-            delay, expected = 0, first
+            delay, expected = 0, filtered(first, smooth)
     expected = expected[:, order]
     turn = _turn(seen, expected, left, fresh) if seen.shape[1] == 3 else None
     told = left < TOLD if turn is None else np.ones(3, bool)
@@ -170,6 +170,15 @@ def staleness(seen: Array, expected: Array) -> tuple[float, int]:
     return share, held if regular else 1
 
 
+def filtered(values: Array, share: float) -> Array:
+    """[N, n] after a low-pass filter; it begins anew where a value is not finite."""
+    out = np.array(values)
+    for k in range(1, len(out)):
+        before = np.where(np.isfinite(out[k - 1]), out[k - 1], values[k])
+        out[k] = before + share * (values[k] - before)
+    return out
+
+
 def _filtered(seen: Array, expected: Array, left: Array) -> float:
     """Share of the new value where seen is a low-pass filter of expected: y += share (a x + b - y); else 1."""
     shares, gains = [], []
@@ -180,8 +189,9 @@ def _filtered(seen: Array, expected: Array, left: Array) -> float:
         columns = np.stack([y[:-1][rows], x[1:][rows], np.ones(rows.sum())], 1)
         found, *_ = np.linalg.lstsq(columns, y[1:][rows], rcond=None)
         rest = np.var(y[1:][rows] - columns @ found) / np.var(y[1:][rows])
+        alone = unexplained(y[1:][rows][:, None], y[:-1][rows][:, None])[0, 0]  # every slow signal follows itself
         shares.append(1.0 - found[0])
-        gains.append(np.log(max(now, FLOOR)) - np.log(max(rest, FLOOR)))
+        gains.append(np.log(max(min(now, alone), FLOOR)) - np.log(max(rest, FLOOR)))
     if not shares or np.mean(gains) < np.log(BETTER_FRAME) or np.std(shares) > 0.1:
         return 1.0
     share = float(np.median(shares))

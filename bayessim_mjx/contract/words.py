@@ -12,6 +12,7 @@ SENTENCES = {
     "axes": "axes are turned by {found}",
     "quaternion_order": "quaternion in the order {found} in place of {expected}",
     "inverse": "quaternion is that of the inverse rotation (conjugate)",
+    "command_fed_back": "previous commands are fed back in place of actions",
     "other_source": "shows {found}",
     "unrelated": "follows from no logged source",
     "frozen": "constant at {found} while its source moves",

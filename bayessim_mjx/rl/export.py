@@ -22,7 +22,7 @@ from bayessim_mjx.env import Env, Task
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import meaning, normalise, recurrent
 from bayessim_mjx.rl.networks import Policy
-from bayessim_mjx.rl.onnx_graph import Graph, network
+from bayessim_mjx.rl.onnx_graph import Graph, network, observation_limit
 
 OPSET, IR_VERSION = 17, 8  # of 2022: every runtime since reads it
 GOLDEN = 8  # observations with the policy's answers, for a check on the target machine
@@ -88,7 +88,7 @@ def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None)
 
 def metadata(policy: Policy, env: Env) -> dict[str, Any]:
     """Describe the inputs and outputs, in their order, with golden pairs of observations and actions."""
-    scaling, golden = command_scale(env, env.action_size - recurrent.memory_size(policy.actor)), golden_inputs(policy)
+    scaling, golden = command_scale(env, env.action_size - recurrent.memory_size(policy.actor)), golden_inputs(policy, env)
     facts = {
         "task": env.name,
         "observation_names": list(getattr(env, "observation_names", ())),
@@ -109,7 +109,7 @@ def metadata(policy: Policy, env: Env) -> dict[str, Any]:
 def _contract(policy: Policy, env: Env) -> dict[str, Any]:
     """Describe what `policy check` compares: meaning of each observation, limits, normaliser, ranges of commands."""
     names, meant = list(getattr(env, "observation_names", ())), meaning.of_task(env)
-    limit = getattr(env, "observation_clip", {}).get(getattr(env, "variant", ""))
+    limit = observation_limit(env)
     limited, span = env.mj_model.actuator_ctrllimited.astype(bool), env.mj_model.actuator_ctrlrange
     facts: dict[str, Any] = {
         "observation_clip": limit,
@@ -123,12 +123,17 @@ def _contract(policy: Policy, env: Env) -> dict[str, Any]:
     return facts
 
 
-def golden_inputs(policy: Policy, count: int = GOLDEN) -> dict[str, jax.Array]:
-    """Draw inputs [count, ...]: observations spread like those of the training, some far outside; and memories."""
+def golden_inputs(policy: Policy, env: Env, count: int = GOLDEN) -> dict[str, jax.Array]:
+    """Draw inputs [count, ...]: observations spread like those of the training, some far outside; and memories.
+
+    They are within the limit of the task's observations: the file clips them, and the policy alone does not.
+    """
     key, memory_key = jax.random.split(jax.random.PRNGKey(0))
     noise = jax.random.normal(key, (count, policy.normalizer.mean.shape[0]))
     factor = jnp.where(jnp.arange(count) % 4 == 3, 20.0, 1.0)[:, None]
-    inputs = {"observation": policy.normalizer.mean + factor * noise * jnp.sqrt(policy.normalizer.var)}
+    observation = policy.normalizer.mean + factor * noise * jnp.sqrt(policy.normalizer.var)
+    limit = observation_limit(env)
+    inputs = {"observation": observation if limit is None else jnp.clip(observation, -limit, limit)}
     size = recurrent.memory_size(policy.actor)
     return inputs | ({"memory": jax.random.uniform(memory_key, (count, size), minval=-1)} if size else {})
 
@@ -155,7 +160,7 @@ def write(path: Path, policy: Policy, env: Env, notes: Mapping[str, Any] | None 
     data = onnx_model(policy, env, notes).SerializeToString()
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
-    inputs = golden_inputs(policy)
+    inputs = golden_inputs(policy, env)
     return difference(path, inputs, answer(policy, inputs))
 
 

@@ -8,6 +8,7 @@ the body's axes), `velocity_world:<joint>.x`; `action:<actuator>` (previous acti
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
@@ -30,6 +31,7 @@ UNITS = {
     **{"turning_world": "rad/s", "velocity": "m/s", "velocity_world": "m/s", "action": "1", "task": ""},
 }
 
+_KNOWN: weakref.WeakKeyDictionary[Env, list[Any]] = weakref.WeakKeyDictionary()  # probing compiles a program
 Entry = dict[str, Any] | None  # terms: {source: weight}, offset, unit of the sources; None: no such form
 
 
@@ -41,9 +43,11 @@ def of_task(env: Env) -> list[Entry] | None:
     env = env.unwrapped
     if not isinstance(env, Task):
         return None
-    sources, values, seen = _probes(env)
-    units = _units(env.mj_model)
-    return [_entry(sources, values, column, units) for column in seen.T]
+    if env not in _KNOWN:
+        sources, values, seen = _probes(env)
+        units = _units(env.mj_model)
+        _KNOWN[env] = [_entry(sources, values, column, units) for column in seen.T]
+    return _KNOWN[env]
 
 
 def _entry(sources: Sequence[str], values: np.ndarray, seen: np.ndarray, units: dict[str, str]) -> Entry:
