@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bayessim_mjx.contract.evidence import Finding, Result
-from bayessim_mjx.quantities import listed, number, percent
+from bayessim_mjx.quantities import compact, listed, percent
 
 MOST = 4  # names that a sentence lists; more only by their number
 SENTENCES = {
@@ -19,8 +19,8 @@ SENTENCES = {
     "sign": "sign is flipped",
     "unit": "in {found} in place of {expected}",
     "scale": "scale {found} in place of {expected}",
-    "scale_missing": "scale {expected} is not applied",
-    "scale_twice": "scale {expected} is applied twice",
+    "scale_missing": "scale {found} in place of {expected} (it is not applied)",
+    "scale_twice": "scale {found} in place of {expected} (it is applied twice)",
     "pose_missing": "default pose is not {pose}",
     "pose_twice": "default pose is {pose} twice",
     "pose_added": "default pose has the wrong sign",
@@ -116,4 +116,4 @@ def verdict(result: Result) -> str:
 
 
 def _text(value: float | str | None) -> str:
-    return number(float(value)) if isinstance(value, int | float) else str(value or "")
+    return compact(value, 3) if isinstance(value, int | float) else str(value or "")
