@@ -46,7 +46,7 @@ COMMANDS = {
     ),
     "logs": Command(
         LOGS,
-        "check logs; convert MCAP, ROS bags, LeRobot, HDF5",
+        "check and show logs; convert MCAP, ROS bags, LeRobot, HDF5",
         ("check LOGS --model robot.xml", "from-mcap run.mcap --model robot.xml --out logs"),
         "import_logs",
     ),

@@ -239,8 +239,10 @@ def _same(found: tuple[str, str, set[str], Any], truth: tuple[str, str, list[str
     if truth[3] is None or found[3] == truth[3]:
         return True
     numbers = isinstance(truth[3], float) and isinstance(found[3], float)
+    if not numbers:
+        return False
     slack = 0.06 if truth[1] == "stale" else 0.1 * abs(truth[3])  # what is lost is drawn: three sd of 400 steps
-    return numbers and abs(found[3] - truth[3]) <= slack
+    return abs(found[3] - truth[3]) <= slack
 
 
 def main() -> int:
