@@ -23,7 +23,9 @@ def _parser() -> cli.PlainParser:
     check.add_argument("--logs", metavar="DIR", required=True, help="folder of logs, or one file")
     check.add_argument("--manifest", metavar="FILE", help="JSON file with fields in place of the policy's own")
     check.add_argument("--golden", metavar="FILE", help="JSON file with observation and action of the robot's computer")
-    check.add_argument("--model", metavar="FILE", help="MJCF or URDF model; it names the columns of qpos[0], qvel[0] ...")
+    check.add_argument(
+        "--model", metavar="FILE", help="MJCF or URDF model; it names the columns of qpos[0], qvel[0] ..."
+    )
     cli.of_urdf(check)
     check.add_argument("--out", metavar="FILE", help="write the findings as JSON")
     return parser
@@ -36,8 +38,8 @@ def _policy(argv: Sequence[str] | None) -> int:
         cli.writable(Path(args.out).parent, "--out")
     from bayessim_mjx.contract.check import check
 
-    paths = [Path(path) if path else None for path in (args.manifest, args.golden)]
-    result = check(Path(args.policy), Path(args.logs), *paths, _channels(args))
+    given, golden = (Path(path) if path else None for path in (args.manifest, args.golden))
+    result = check(Path(args.policy), Path(args.logs), given, golden, _channels(args))
     _show(result)
     if args.out:
         Path(args.out).write_text(json.dumps(_facts(result), indent=1) + "\n", encoding="utf-8")

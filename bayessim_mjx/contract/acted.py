@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from bayessim_mjx.contract.amounts import NEAR
 from bayessim_mjx.contract.axes import findings as of_order
 from bayessim_mjx.contract.evidence import Evidence, Finding, Result, shifted
+from bayessim_mjx.contract.judged import judge
 from bayessim_mjx.contract.manifest import Entry
-from bayessim_mjx.contract.observed import judge
 from bayessim_mjx.contract.relate import Relation, relate
 
 Array = NDArray[np.float64]
@@ -71,7 +71,9 @@ def actions(evidence: Evidence, result: Result, normalised: bool) -> None:
     names = evidence.manifest.actions
     seen = np.concatenate([run.action for run in evidence.runs])
     inputs = _inputs(evidence)
-    left = {name: _left(seen, np.concatenate(answers), evidence.manifest.action_limit) for name, answers in inputs.items()}
+    left = {
+        name: _left(seen, np.concatenate(answers), evidence.manifest.action_limit) for name, answers in inputs.items()
+    }
     best = min(left, key=lambda name: left[name])
     if best != "" and left[best] < CLOSE * left[""] and left[best] < CLOSE:
         if best == "normaliser_missing" and normalised:
@@ -178,7 +180,9 @@ def _limits(result: Result, seen: Array, answers: Array, names: Sequence[str], e
         if ends:
             smaller[name] = max(map(abs, ends))
     if smaller:
-        result.findings.append(Finding("action", "clip_smaller", tuple(smaller), float(np.median([*smaller.values()])), limit))
+        result.findings.append(
+            Finding("action", "clip_smaller", tuple(smaller), float(np.median([*smaller.values()])), limit)
+        )
 
 
 def _command_is_clipped(evidence: Evidence) -> bool:
@@ -194,7 +198,7 @@ def _command_is_clipped(evidence: Evidence) -> bool:
 
 
 def _noise(seen: Array, answers: Array, limit: float) -> float:
-    """Standard deviation of noise that was added to the answers; 0 where the difference is no white noise."""
+    """Compute the standard deviation of noise that was added to the answers; 0 where the rest is no white noise."""
     rows = np.isfinite(seen).all(1) & np.isfinite(answers).all(1)
     inside = (np.abs(answers) < 0.7 * limit).all(1) & (np.abs(seen) < limit).all(1)
     rows &= inside if (rows & inside).sum() > 30 else True
@@ -207,7 +211,9 @@ def _noise(seen: Array, answers: Array, limit: float) -> float:
         return 0.0
     following = np.flatnonzero(rows)
     pairs = following[1:][np.diff(following) == 1]
-    lagged = np.mean((seen[pairs] - answers[pairs] - rest.mean(0)) * (seen[pairs - 1] - answers[pairs - 1] - rest.mean(0)), 0)
+    lagged = np.mean(
+        (seen[pairs] - answers[pairs] - rest.mean(0)) * (seen[pairs - 1] - answers[pairs - 1] - rest.mean(0)), 0
+    )
     white = np.abs(lagged / np.maximum(size**2, 1e-12)).mean() < 0.2
     level = np.abs(rest.mean(0)).max() < 0.3 * size.max()
     moving = np.maximum(answers[rows].std(0), 1e-9)
@@ -227,11 +233,15 @@ def commands(evidence: Evidence, result: Result) -> None:
         return
     limit, scale, offset = manifest.action_limit, manifest.scale, manifest.offset
     ctrl = np.concatenate([run.ctrl for run in evidence.runs])
-    made = [offset + scale * np.clip(a, -limit, limit) for a in evidence.acted]
+    bound = limit if _command_is_clipped(evidence) else np.inf  # that the clip is missing is said of the actions
+    made = [offset + scale * np.clip(a, -bound, bound) for a in evidence.acted]
     names = manifest.actions
     low, high = manifest.command_range.T
     whole = np.concatenate(made)
-    if _left(ctrl, np.clip(whole, low, high), np.inf) < EQUAL and np.nanmax(np.abs(np.nanmean(ctrl - np.clip(whole, low, high), axis=0) / scale)) < NEAR:
+    if (
+        _left(ctrl, np.clip(whole, low, high), np.inf) < EQUAL
+        and np.nanmax(np.abs(np.nanmean(ctrl - np.clip(whole, low, high), axis=0) / scale)) < NEAR
+    ):
         result.compared.setdefault("command", []).extend(names)
         return
     entries = [Entry(n, {f"action:{n}": float(s)}, float(o), "") for n, s, o in zip(names, scale, offset, strict=True)]

@@ -61,7 +61,10 @@ def merged(entries: Sequence[Entry], seen: Array, found: list[Finding], relation
     if kind == "gravity" and len(entries) == 3 and any(f.kind == "frozen" for f in found):
         down = np.nanmedian(seen, axis=0)
         axis = [entry.source[-1] for entry in entries]
-        if abs(down[axis.index("z")]) > 0.9 * abs(entries[0].weight) and np.abs(np.delete(down, axis.index("z"))).max() < 0.1:
+        if (
+            abs(down[axis.index("z")]) > 0.9 * abs(entries[0].weight)
+            and np.abs(np.delete(down, axis.index("z"))).max() < 0.1
+        ):
             return [Finding("observation", "frame", names, "world", "")]
     if kind in VECTORS and len(entries) == 3 and relation.turn is None:
         return _signed(names, found, relation)
@@ -111,5 +114,9 @@ def _angle(matrix: Array) -> str:
     if spin @ axis < 0 or (abs(spin @ axis) < 1e-6 and axis[np.argmax(np.abs(axis))] < 0):
         axis = -axis
     k = int(np.argmax(np.abs(axis)))
-    text = ("" if axis[k] > 0 else "-") + "xyz"[k] if abs(axis[k]) > 0.98 else "(" + ", ".join(f"{v:.2f}" for v in axis) + ")"
+    text = (
+        ("" if axis[k] > 0 else "-") + "xyz"[k]
+        if abs(axis[k]) > 0.98
+        else "(" + ", ".join(f"{v:.2f}" for v in axis) + ")"
+    )
     return f"{5 * round(degrees / 5):g} degrees about {text}"

@@ -32,7 +32,9 @@ def check(
     contract = manifest.read(facts, str(policy) if given is None else f"{policy} with {given}")
     if len(contract.observations) != network.size:
         names = len(contract.observations)
-        raise UserError(f"{policy}: the network takes {network.size} numbers, the manifest names {names}; {manifest.AGAIN}")
+        raise UserError(
+            f"{policy}: the network takes {network.size} numbers, the manifest names {names}; {manifest.AGAIN}"
+        )
     pairs = _pairs(golden, contract) if golden is not None else None
     evidence = Evidence(recording.read_runs(logs, contract, model), contract, network)
     result = Result(notes=[f"lacks {key}" for key in contract.lacks])
@@ -60,7 +62,8 @@ def _pairs(path: Path, contract: manifest.Manifest) -> dict[str, NDArray[np.floa
     if "observation" not in own or "action" not in own:
         raise UserError(f"{path}: allowed: a JSON file with observation and action, lists of rows")
     try:
-        pairs = {key: np.array(own[key], float) for key in ("observation", "action", "memory") if key in own}
+        keys = [key for key in ("observation", "action", "memory") if key in own]
+        pairs: dict[str, NDArray[np.float64]] = {key: np.array(own[key], float) for key in keys}
     except ValueError as error:
         raise UserError(f"{path}: rows of numbers are needed ({error})") from None
     for key, count in (("observation", len(contract.observations)), ("action", len(contract.actions))):

@@ -15,7 +15,9 @@ from bayessim_mjx.errors import UserError
 
 Array = NDArray[np.float64]
 NEEDED = ("observation_names", "action_names", "control_dt")  # without these there is nothing to compare
-AGAIN = "export the policy again with this version (bayessim-mjx play --export), or give these fields in --manifest FILE"
+AGAIN = (
+    "export the policy again with this version (bayessim-mjx play --export), or give these fields in --manifest FILE"
+)
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,9 @@ def read(facts: Mapping[str, Any], source: str) -> Manifest:
         observation_clip=np.inf if clip is None else float(clip),
         mean=_numbers(source, own, "normaliser_mean", len(names)),
         std=_numbers(source, own, "normaliser_std", len(names)),
-        golden={k: np.array(own[f"golden_{k}"], float) for k in ("observation", "action", "memory") if f"golden_{k}" in own},
+        golden={
+            k: np.array(own[f"golden_{k}"], float) for k in ("observation", "action", "memory") if f"golden_{k}" in own
+        },
         lacks=tuple(key for key in ("observation_meaning", "golden_action") if key not in own),
     )
 
@@ -120,7 +124,9 @@ def of_file(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read as JSON ({error}); allowed: an object with {', '.join(NEEDED)}") from None
+        raise UserError(
+            f"{path}: cannot be read as JSON ({error}); allowed: an object with {', '.join(NEEDED)}"
+        ) from None
     if not isinstance(found, dict):
         raise UserError(f"{path}: holds no JSON object; allowed: an object with {', '.join(NEEDED)}")
     return found
@@ -139,7 +145,9 @@ def _entry(source: str, name: str, meant: Any) -> Entry:
     if meant is None:
         return Entry(name, {})
     if not isinstance(meant, Mapping) or not isinstance(meant.get("terms"), Mapping):
-        raise UserError(f"{source}: observation_meaning of {name} is {meant!r}; allowed: {{terms, offset, unit}} or null")
+        raise UserError(
+            f"{source}: observation_meaning of {name} is {meant!r}; allowed: {{terms, offset, unit}} or null"
+        )
     terms = {str(key): float(value) for key, value in meant["terms"].items()}
     return Entry(name, terms, float(meant.get("offset", 0.0)), str(meant.get("unit", "")))
 

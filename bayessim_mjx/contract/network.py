@@ -58,14 +58,16 @@ class Network:
         Args:
             observation: [K, S]; rows that are not finite give NaN. forgets: the memory is zero in every step.
         """
-        bad = ~np.isfinite(observation).all(1)
-        filled = np.where(bad[:, None], 0.0, observation)
+        bad = ~np.isfinite(observation).all(axis=1, keepdims=True)
+        filled = np.where(bad, 0.0, observation)
         if not self.memory or forgets:
             out = self.answers(filled, np.zeros((len(filled), self.memory)))
         else:
             memory, rows = np.zeros((1, self.memory), np.float32), []
             for row in filled.astype(np.float32):
-                action, memory = self.session.run(["action", "memory_next"], {"observation": row[None], "memory": memory})
+                action, memory = self.session.run(
+                    ["action", "memory_next"], {"observation": row[None], "memory": memory}
+                )
                 rows.append(action[0])
             out = np.array(rows, float)
-        return np.where(bad[:, None], np.nan, out)
+        return np.where(bad, np.nan, out)

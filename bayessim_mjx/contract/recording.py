@@ -116,7 +116,9 @@ def _named(table: Table, found: Mapping[str, Array], manifest: Manifest, model: 
                 raise UserError(f"{table.path}: column {column}: {stream} has {len(known[stream])} entries")
             name = known[stream][int(match[2])]
         elif match and stream in ("qpos", "qvel"):
-            raise UserError(f"{table.path}: column {column}: --model FILE says which joint it is; or name it qpos:<joint>")
+            raise UserError(
+                f"{table.path}: column {column}: --model FILE says which joint it is; or name it qpos:<joint>"
+            )
         elif name and stream in ("observation", "action", "ctrl") and name not in known[stream]:
             raise UserError(f"{table.path}: column {column}: not in the manifest; allowed: {', '.join(known[stream])}")
         out[f"{stream}:{name}" if name else stream] = values

@@ -65,7 +65,9 @@ def relate(seen: Array, reference: Reference, frames: Sequence[str], delays: Seq
     if plain is None:
         return None
     old, held = staleness(seen, plain)
-    fresh = np.append(True, (np.diff(np.nan_to_num(seen), axis=0) != 0).any(1)) if old > STALE else np.ones(len(seen), bool)
+    fresh = (
+        np.append(True, (np.diff(np.nan_to_num(seen), axis=0) != 0).any(1)) if old > STALE else np.ones(len(seen), bool)
+    )
     tables: dict[tuple[str, int], Array] = {}
     for frame in ("", *frames):
         for delay in delays:

@@ -72,7 +72,9 @@ class State:
         logged = self._joint("qvel", joint, indices)
         if logged is None:
             return None
-        stored = "world" if kind.startswith("velocity") else "body"  # MuJoCo's: linear in the world, angular in the body
+        stored = (
+            "world" if kind.startswith("velocity") else "body"
+        )  # MuJoCo's: linear in the world, angular in the body
         own = "world" if kind.endswith("_world") else "body"
         wanted = {"": own, "order": own}.get(frame, frame)
         if wanted == stored and frame != "order":

@@ -136,8 +136,9 @@ def _spectra(sheets: Sequence[Sheet], joints: Sequence[str], pairs: dict[str, li
 
 
 def _coverage(shown: View, joints: Sequence[str]) -> dict[str, Any]:
-    """Maps of the joints, and their numbers as a table."""
-    maps, rows = [], []
+    """Make maps of the joints, and a table of their numbers."""
+    maps: list[dict[str, Any]] = []
+    rows = []
     for joint in joints:
         limits = shown.limits.get(joint)
         found = views.coverage(shown.sheets, joint, limits)
@@ -161,7 +162,9 @@ def _strongest(found: Any) -> dict[str, Any]:
             continue
         order = np.argsort(-np.nan_to_num(own, nan=-1.0))
         best, next_ = int(order[0]), int(order[1]) if len(order) > 1 else None
-        other = f"{found.commands[next_]} ({own[next_]:.2f})" if next_ is not None and math.isfinite(own[next_]) else "–"
+        other = (
+            f"{found.commands[next_]} ({own[next_]:.2f})" if next_ is not None and math.isfinite(own[next_]) else "–"
+        )
         rows.append((joint, found.commands[best], f"{own[best]:.2f}", other))
     return _table(("joint", "moves with", "coherence", "next"), rows)
 

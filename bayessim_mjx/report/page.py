@@ -30,32 +30,36 @@ def render(d: Diagnosis, missed: Any = None, link: str = "", folder: Path = Path
     """Return the page as text; `link`: to the page of the blind check, from this one; `folder`: of the result."""
     from plotly.offline import get_plotlyjs
 
-    return environment().get_template(TEMPLATE).render(
-        plotly=Markup(get_plotlyjs()),
-        width=WIDTH,
-        column=COLUMN,
-        stage_names=STAGES,
-        stage_colours=STAGE,
-        verdict=d.verdict,
-        tone=TONES[d.verdict][1],
-        top=sections.top(d, folder),
-        about=sections.about(d),
-        gap=sections.how_far(d),
-        effects=sections.effects(d),
-        candidates=sections.candidates(d),
-        not_fitted=not_fitted(d),
-        where=sections.where(d),
-        overlays=evidence.overlays(d),
-        parameters=evidence.parameters(d),
-        isolability=evidence.isolability(d),
-        flexible=evidence.flexible(d),
-        black_boxes=evidence.black_boxes(d),
-        experiment=evidence.experiment(d),
-        data=evidence.data(d),
-        warnings=d.warnings,
-        missed=missed,
-        missed_link=quote(link) if link else missed and missed.page.as_uri(),
-        versions=d.versions,
+    return (
+        environment()
+        .get_template(TEMPLATE)
+        .render(
+            plotly=Markup(get_plotlyjs()),
+            width=WIDTH,
+            column=COLUMN,
+            stage_names=STAGES,
+            stage_colours=STAGE,
+            verdict=d.verdict,
+            tone=TONES[d.verdict][1],
+            top=sections.top(d, folder),
+            about=sections.about(d),
+            gap=sections.how_far(d),
+            effects=sections.effects(d),
+            candidates=sections.candidates(d),
+            not_fitted=not_fitted(d),
+            where=sections.where(d),
+            overlays=evidence.overlays(d),
+            parameters=evidence.parameters(d),
+            isolability=evidence.isolability(d),
+            flexible=evidence.flexible(d),
+            black_boxes=evidence.black_boxes(d),
+            experiment=evidence.experiment(d),
+            data=evidence.data(d),
+            warnings=d.warnings,
+            missed=missed,
+            missed_link=quote(link) if link else missed and missed.page.as_uri(),
+            versions=d.versions,
+        )
     )
 
 

@@ -88,7 +88,10 @@ def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None)
 
 def metadata(policy: Policy, env: Env) -> dict[str, Any]:
     """Describe the inputs and outputs, in their order, with golden pairs of observations and actions."""
-    scaling, golden = command_scale(env, env.action_size - recurrent.memory_size(policy.actor)), golden_inputs(policy, env)
+    scaling, golden = (
+        command_scale(env, env.action_size - recurrent.memory_size(policy.actor)),
+        golden_inputs(policy, env),
+    )
     facts = {
         "task": env.name,
         "observation_names": list(getattr(env, "observation_names", ())),

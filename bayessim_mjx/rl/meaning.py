@@ -66,7 +66,7 @@ def _entry(sources: Sequence[str], values: np.ndarray, seen: np.ndarray, units: 
         if np.abs(own - centred @ every).max() > EXACT * spread:
             return None
         large = np.flatnonzero(np.abs(every) > SMALL * np.abs(every).max())
-        weights = {sources[i]: float(every[i]) for i in large}
+        weights = {sources[int(i)]: float(every[i]) for i in large}
     columns = [sources.index(name) for name in weights]
     offset = float(np.median(seen - values[:, columns] @ np.array([*weights.values()])))
     kinds = {units.get(name, UNITS.get(name.partition(":")[0], "")) for name in weights}

@@ -101,7 +101,9 @@ class Code:
         if "limited" in self.wrong:
             action = np.clip(action, -self.wrong["limited"], self.wrong["limited"])
         if "unlimited" in self.wrong:  # the last layer without its clip
-            action = np.where(np.abs(action) >= 1, action * (1 + self.wrong["unlimited"] * self.rng.random(action.shape)), action)
+            action = np.where(
+                np.abs(action) >= 1, action * (1 + self.wrong["unlimited"] * self.rng.random(action.shape)), action
+            )
         self.before, self.last = self.last, action
         return action
 
@@ -263,7 +265,9 @@ def begin(robot: Robot, task: str, rng: np.random.Generator) -> None:
     mujoco.mj_forward(model, data)
 
 
-def record(folder: Path, task: str, model: mujoco.MjModel, net: Path, wrong: dict[str, Any], how: dict[str, Any], seed: int) -> None:
+def record(
+    folder: Path, task: str, model: mujoco.MjModel, net: Path, wrong: dict[str, Any], how: dict[str, Any], seed: int
+) -> None:
     """Write logs of one deployment.
 
     Args:
@@ -284,10 +288,19 @@ def record(folder: Path, task: str, model: mujoco.MjModel, net: Path, wrong: dic
         header = ["time", *(f"{s}:{n}" for s in streams for n in names[s])]
         table = np.array([[row["time"], *np.concatenate([row[s] for s in streams])] for row in rows])
         form = f"%.{how.get('digits', 9)}g"
-        np.savetxt(folder / f"run_{episode}.csv", table, ["%.9g"] + [form] * (len(header) - 1), ",", header=",".join(header), comments="")
+        np.savetxt(
+            folder / f"run_{episode}.csv",
+            table,
+            ["%.9g"] + [form] * (len(header) - 1),
+            ",",
+            header=",".join(header),
+            comments="",
+        )
 
 
-def _episode(robot: Robot, code: Code, how: dict[str, Any], wrong: dict[str, Any], rng: np.random.Generator) -> list[dict]:
+def _episode(
+    robot: Robot, code: Code, how: dict[str, Any], wrong: dict[str, Any], rng: np.random.Generator
+) -> list[dict]:
     dt, rows, t = float(code.net.facts["control_dt"]) * wrong.get("period", 1.0), [], 0.0
     usual = 1.0 if isinstance(code, Drone) else 4.0  # an untrained policy flies no longer
     for k in range(round(how.get("seconds", usual) / dt)):
@@ -304,7 +317,14 @@ def _episode(robot: Robot, code: Code, how: dict[str, Any], wrong: dict[str, Any
             shown = seen or robot.read()
             own = how.get("own_noise", 0.0)
             qpos = shown["qpos"] + own * rng.normal(size=shown["qpos"].shape)
-            rows.append({"time": t + later, **logged, "qpos": qpos, "qvel": shown["qvel"] + 20 * own * rng.normal(size=shown["qvel"].shape)})
+            rows.append(
+                {
+                    "time": t + later,
+                    **logged,
+                    "qpos": qpos,
+                    "qvel": shown["qvel"] + 20 * own * rng.normal(size=shown["qvel"].shape),
+                }
+            )
 
         write(0.0, seen)
         late = rng.random() < max(how.get("jitter", 0.0), wrong.get("late_steps", 0.0))

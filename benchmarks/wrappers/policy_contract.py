@@ -111,7 +111,9 @@ def late(name: str, *truth: tuple) -> Plant:
 
 def scales(rng: np.random.Generator) -> tuple[dict[str, Any], Truth]:
     factor = float(rng.choice([0.5, 2.0, 0.7, 1.4]))
-    return {"action_scale": factor}, [("command", "scale_missing" if factor == 2.0 else "scale_twice" if factor == 0.5 else "scale", JOINTS, None)]
+    return {"action_scale": factor}, [
+        ("command", "scale_missing" if factor == 2.0 else "scale_twice" if factor == 0.5 else "scale", JOINTS, None)
+    ]
 
 
 MISTAKES: list[tuple[str, str, Plant]] = [
@@ -139,10 +141,23 @@ MISTAKES: list[tuple[str, str, Plant]] = [
     ("observation late", "Anymal", late("observation_late", obs("delay", []))),
     ("observation refreshed every second step", "Anymal", fixed("observation_every", obs("held", [], 2.0), amount=2)),
     ("observations lost", "Anymal", amount("packets_lost", 0.2, 0.4, obs("stale", [], "amount"))),
-    ("targets not scaled", "Anymal", fixed("target_factors", obs("scale_missing", ["command_x", "command_y"]), obs("scale_missing", ["command_yaw"]), amount=(1.0, 1.0, 1.0))),
+    (
+        "targets not scaled",
+        "Anymal",
+        fixed(
+            "target_factors",
+            obs("scale_missing", ["command_x", "command_y"]),
+            obs("scale_missing", ["command_yaw"]),
+            amount=(1.0, 1.0, 1.0),
+        ),
+    ),
     ("action not fed back", "Anymal", fixed("no_action_fed_back", obs("frozen", [f"{j}_action" for j in JOINTS], 0.0))),
     ("command fed back", "Anymal", fixed("command_fed_back", obs("command_fed_back", [f"{j}_action" for j in JOINTS]))),
-    ("action of two steps ago fed back", "Anymal", fixed("action_of_two_steps", obs("delay", [f"{j}_action" for j in JOINTS], 1.0))),
+    (
+        "action of two steps ago fed back",
+        "Anymal",
+        fixed("action_of_two_steps", obs("delay", [f"{j}_action" for j in JOINTS], 1.0)),
+    ),
     ("action scale", "Anymal", scales),
     ("default pose not added", "Anymal", fixed("pose_not_added", ("command", "pose_missing", JOINTS, None))),
     ("command late", "Anymal", late("command_late", ("command", "delay", [], None))),
@@ -166,11 +181,27 @@ MORE: list[tuple[str, str, Plant]] = [
     ("cart in mm", "Cartpole", fixed("cart_in_mm", obs("unit", ["cart_position"], "mm"))),
     ("pole in degrees/s", "Cartpole", fixed("pole_in_degrees", obs("unit", ["pole_velocity"], "degrees/s"))),
     ("cart's speed reversed", "Cartpole", fixed("cart_speed_reversed", obs("sign", ["cart_velocity"]))),
-    ("angle and its rate swapped", "Cartpole", fixed("angle_and_spin_swapped", obs("other_source", ["pole_angle"], "pole_velocity"), obs("other_source", ["pole_velocity"], "pole_angle"))),
+    (
+        "angle and its rate swapped",
+        "Cartpole",
+        fixed(
+            "angle_and_spin_swapped",
+            obs("other_source", ["pole_angle"], "pole_velocity"),
+            obs("other_source", ["pole_velocity"], "pole_angle"),
+        ),
+    ),
     ("sine and cosine swapped", "Pendulum", fixed("sine_and_cosine_swapped", obs("order", ["cos_theta", "sin_theta"]))),
     ("speed in rpm", "Pendulum", fixed("speed_in_rpm", obs("unit", ["theta_dot"], "rpm"))),
-    ("actions limited", "Cartpole", amount("limited", 0.4, 0.7, ("action", "clip_smaller", ["slider_to_cart"], "amount"))),
-    ("actions without limit", "Cartpole", fixed("unlimited", ("action", "clip_missing", ["slider_to_cart"], None), amount=0.8)),
+    (
+        "actions limited",
+        "Cartpole",
+        amount("limited", 0.02, 0.04, ("action", "clip_smaller", ["slider_to_cart"], "amount")),
+    ),
+    (
+        "actions without limit",
+        "Cartpole",
+        fixed("unlimited", ("action", "clip_missing", ["slider_to_cart"], None), amount=0.8),
+    ),
     ("late steps", "Quadcopter", fixed("late_steps", ("clock", "late_steps", [], None), amount=0.2)),
 ]
 RIGHT: list[tuple[str, str, dict[str, Any]]] = [
@@ -264,15 +295,23 @@ def main() -> int:
             rows.append(_case(folder / f"{k}", made[task], task, name, wrong, truth, how, 1000 * args.seed + k))
     for k, (name, task, how) in enumerate([] if args.more else RIGHT):
         if args.only in name:
-            rows.append(_case(folder / f"right_{k}", made[task], task, f"right: {name}", {}, [], how, 7000 + 1000 * args.seed + k))
+            rows.append(
+                _case(
+                    folder / f"right_{k}", made[task], task, f"right: {name}", {}, [], how, 7000 + 1000 * args.seed + k
+                )
+            )
     planted, right = ([r for r in rows if bool(r["truth"]) is wrong] for wrong in (True, False))
-    print(f"named {sum(r['named'] for r in planted)} of {len(planted)}; accused {sum(not r['named'] for r in right)} of {len(right)}; {time.perf_counter() - begun:.0f} s")
+    named_, accused = sum(r["named"] for r in planted), sum(not r["named"] for r in right)
+    seconds = time.perf_counter() - begun
+    print(f"named {named_} of {len(planted)}; accused {accused} of {len(right)}; {seconds:.0f} s")
     if args.record:
         args.record.write_text(json.dumps({"seed": args.seed, "rows": rows}, indent=1) + "\n")
     return 0
 
 
-def _case(folder: Path, made: Any, task: str, name: str, wrong: dict, truth: Truth, how: dict, seed: int) -> dict[str, Any]:
+def _case(
+    folder: Path, made: Any, task: str, name: str, wrong: dict, truth: Truth, how: dict, seed: int
+) -> dict[str, Any]:
     model, right, other = made
     d.record(folder, task, model, other if "other_policy" in wrong else right, wrong, how, seed)
     result = check(right, folder)

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 DT = 0.02  # s
@@ -78,7 +77,13 @@ def motion(seed: int, steps: int) -> dict[str, np.ndarray]:
     speeds = np.einsum("ij,ijk->kj", size * rate, np.cos(rate[:, :, None] * t + phase[:, :, None]))
     quat = np.stack([np.ones(steps), 0.5 * waves[:, 0], 0.5 * waves[:, 1], waves[:, 2]], 1)
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)
-    return {"time": t, "q": HOME + 0.6 * waves[:, 3:5], "v": 0.6 * speeds[:, 3:5], "quat": quat, "spin": 2 * waves[:, 5:8]}
+    return {
+        "time": t,
+        "q": HOME + 0.6 * waves[:, 3:5],
+        "v": 0.6 * speeds[:, 3:5],
+        "quat": quat,
+        "spin": 2 * waves[:, 5:8],
+    }
 
 
 def observe(m: dict[str, np.ndarray], k: int, last: np.ndarray) -> np.ndarray:
@@ -91,9 +96,14 @@ def write_log(
     path: Path, observation: Any = observe, command: Any = lambda a: HOME + 0.5 * a, noise: float = 0.0, seed: int = 0,
     steps: int = 300, acted: Any = act, drop: tuple[str, ...] = (), dt: float = DT,
 ) -> Path:  # fmt: skip
-    """A log of the deployed policy: `observation(motion, step, last action)`, `command(action)`, `acted(observation)`."""
+    """Write a log of the policy: `observation(motion, step, last action)`, `command(action)`, `acted(observation)`."""
     m, rng, last, rows = motion(seed, steps), np.random.default_rng(seed + 1), np.zeros(2), []
-    header = ["time", *(f"observation:{n}" for n in NAMES), *(f"action:{j}" for j in JOINTS), *(f"ctrl:{j}" for j in JOINTS)]
+    header = [
+        "time",
+        *(f"observation:{n}" for n in NAMES),
+        *(f"action:{j}" for j in JOINTS),
+        *(f"ctrl:{j}" for j in JOINTS),
+    ]
     header += [*(f"qpos:{j}" for j in JOINTS), *(f"qvel:{j}" for j in JOINTS)]
     header += [*(f"qpos:root[{i}]" for i in range(7)), *(f"qvel:root[{i}]" for i in range(6))]
     for k in range(steps):

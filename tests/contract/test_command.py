@@ -54,7 +54,9 @@ def test_an_older_file_says_what_it_lacks(tmp_path: Path, capsys: pytest.Capture
     old = robots.manifest()
     meaning = old.pop("observation_meaning")
     policy = robots.write_policy(tmp_path / "old.onnx", old)
-    robots.write_log(tmp_path / "logs" / "run.csv", lambda m, k, a: robots.observe(m, k, a) * np.array([1.0] * 6 + [-1, 1] + [1] * 4))
+    robots.write_log(
+        tmp_path / "logs" / "run.csv", lambda m, k, a: robots.observe(m, k, a) * np.array([1.0] * 6 + [-1, 1] + [1] * 4)
+    )
     assert run(policy, "--logs", tmp_path / "logs") == 0
     assert "exported by an older version" in capsys.readouterr().out
     (tmp_path / "more.json").write_text(json.dumps({"observation_meaning": meaning}))
@@ -76,7 +78,12 @@ def test_golden_pairs_of_another_machine(policy: Path, tmp_path: Path, capsys: p
 
 def test_arrays_are_named_by_the_model(policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     log = robots.write_log(tmp_path / "logs" / "run.csv")
-    for old, new in (("qpos:hip", "qpos[7]"), ("qpos:knee", "qpos[8]"), ("qvel:hip", "qvel[6]"), ("qvel:knee", "qvel[7]")):
+    for old, new in (
+        ("qpos:hip", "qpos[7]"),
+        ("qpos:knee", "qpos[8]"),
+        ("qvel:hip", "qvel[6]"),
+        ("qvel:knee", "qvel[7]"),
+    ):
         log.write_text(log.read_text().replace(old, new, 1))
     assert run(policy, "--logs", tmp_path / "logs") == 2
     assert "--model" in capsys.readouterr().err

@@ -78,7 +78,9 @@ def test_the_page_has_every_section_and_loads_nothing(tmp_path: Path, capsys: py
     out = tmp_path / "page" / "show.html"
     show(capsys, logs(tmp_path), "--model", model_of(tmp_path), "--out", out)
     page = out.read_text()
-    assert [f'id="{name}"' in page for name in ("time", "coverage", "excitation", "spectra", "rates", "columns")] == [True] * 6
+    assert [f'id="{name}"' in page for name in ("time", "coverage", "excitation", "spectra", "rates", "columns")] == [
+        True
+    ] * 6
     own = page[page.rindex("</script>\n</head>") :]  # without plotly.js
     assert "1 log, 4.0 s of motion, 2 positions, 2 commands" in own
     assert not re.search(r"(?:src|href)=\"(?:https?:)?//", own)
