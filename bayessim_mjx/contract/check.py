@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.contract import acted, manifest, observed, recording
+from bayessim_mjx.contract import acted, driven, manifest, observed, rebuilt, recording
 from bayessim_mjx.contract.evidence import Evidence, Finding, Result
 from bayessim_mjx.contract.network import Network
 from bayessim_mjx.errors import UserError
@@ -44,8 +44,13 @@ def check(
         normalised = observed.compare(evidence, result)
         if normalised:
             result.findings.append(Finding("observation", "normalised"))
-    acted.actions(evidence, result, normalised)
-    acted.commands(evidence, result)
+        acted.actions(evidence, result, normalised)
+        acted.commands(evidence, result)
+    elif rebuilt.compare(evidence, result) and evidence.has("action"):
+        acted.commands(evidence, result)
+    elif "rebuilt_unlike" in result.notes:
+        acted.commands(evidence, result, strict=True)
+    driven.compare(evidence, result)
     acted.clock(evidence, result, _fed_back(evidence, result))
     return result
 

@@ -63,15 +63,43 @@ class Evidence:
         return np.concatenate([run.observation for run in self.runs])
 
     @cached_property
+    def rebuilt(self) -> bool:
+        """Whether no observation was logged, so that those of the manifest stand for them."""
+        return not self.has("observation")
+
+    @cached_property
+    def given(self) -> list[Array]:
+        """Observations [K, S] of each run: as logged, else as the manifest says by the logged state."""
+        return [self.rebuild(run) if self.rebuilt else run.observation for run in self.runs]
+
+    def rebuild(self, run: Run) -> Array:
+        """[K, S] observations by the logged state and the previous actions; NaN where these were not logged."""
+        before = shifted(self.fed(run), 1)
+        before[0] = 0.0
+        names, columns = self.manifest.actions, []
+        for entry in self.manifest.observations:
+            if entry.kind == "action":
+                column: Array | None = entry.weight * before[:, names.index(entry.source[7:])] + entry.offset
+            else:
+                column = State(run, 0.0).entry(entry)
+            columns.append(np.full(len(run.time), np.nan) if column is None else column)
+        return np.stack(columns, 1)
+
+    def fed(self, run: Run) -> Array:
+        """[K, A] actions as logged, else those that the logged commands are made of."""
+        if np.isfinite(run.action).any() or self.manifest.scale is None or self.manifest.offset is None:
+            return run.action
+        return (run.ctrl - self.manifest.offset) / self.manifest.scale
+
+    @cached_property
     def answers(self) -> list[Array]:
-        """Actions [K, A] of the file at the logged observations, of each run."""
-        return [self.network.run(run.observation) for run in self.runs]
+        """Actions [K, A] of the file at the observations of each run."""
+        return [self.network.run(observation) for observation in self.given]
 
     @cached_property
     def acted(self) -> list[Array]:
         """Actions [K, A] of each run: as logged, else the file's answers."""
-        given = any(np.isfinite(run.action).any() for run in self.runs)
-        return [run.action for run in self.runs] if given else self.answers
+        return [run.action for run in self.runs] if self.has("action") else self.answers
 
     def has(self, stream: str) -> bool:
         """Whether any run has `observation`, `action` or `ctrl`."""

@@ -57,6 +57,7 @@ class Manifest:
     Attributes:
         observations: entries in their order. actions: names of the actuators in their order. dt: control period, s.
         action_limit: largest action. scale, offset: commands are offset + scale * action; None: of another form.
+        targets: the joint whose target position each command is; "" for other commands.
         command_range: [A, 2] of the actuators, infinite where there is none. observation_clip: inf where there is none.
         mean, std: of the normaliser that is inside the file; None: it has none, or does not say it.
         golden: pairs {observation, action[, memory]}. lacks: fields that an older export has not.
@@ -68,6 +69,7 @@ class Manifest:
     action_limit: float
     scale: Array | None
     offset: Array | None
+    targets: tuple[str, ...]
     command_range: Array
     observation_clip: float
     mean: Array | None
@@ -96,6 +98,8 @@ def read(facts: Mapping[str, Any], source: str) -> Manifest:
     scale, offset = (_numbers(source, own, f"action_{key}", len(actions)) for key in ("scale", "offset"))
     ranges = own.get("command_range") or [None] * len(actions)
     _length(source, "command_range", ranges, len(actions))
+    targets = own.get("command_joint") or [None] * len(actions)
+    _length(source, "command_joint", targets, len(actions))
     clip = own.get("observation_clip")
     return Manifest(
         observations=entries,
@@ -104,6 +108,7 @@ def read(facts: Mapping[str, Any], source: str) -> Manifest:
         action_limit=min(1.0, float(own.get("action_clip", 1.0))),
         scale=scale,
         offset=offset if offset is not None or scale is None else np.zeros(len(actions)),
+        targets=tuple(str(joint or "") for joint in targets),
         command_range=np.array([r if r is not None else (-np.inf, np.inf) for r in ranges], float),
         observation_clip=np.inf if clip is None else float(clip),
         mean=_numbers(source, own, "normaliser_mean", len(names)),

@@ -55,11 +55,18 @@ def unexplained(seen: Array, expected: Array) -> Array:
     return np.clip(1.0 - r**2, FLOOR, 1.0)
 
 
-def relate(seen: Array, reference: Reference, frames: Sequence[str], delays: Sequence[int] = DELAYS) -> Relation | None:
+def relate(
+    seen: Array,
+    reference: Reference,
+    frames: Sequence[str],
+    delays: Sequence[int] = DELAYS,
+    better_order: float = BETTER_ORDER,
+) -> Relation | None:
     """Find frame, delay and order; None where no reference can be computed or too few rows are there.
 
     Args:
         seen: [N, g]. reference: gives [N, g] or None. frames: other than that of the manifest.
+        better_order: factor by which another order has to explain the entries better.
     """
     plain = reference("", 0)
     if plain is None:
@@ -82,7 +89,7 @@ def relate(seen: Array, reference: Reference, frames: Sequence[str], delays: Seq
     frame, delay = _simplest(tables)
     expected = reference(frame, delay)
     assert expected is not None
-    order = _order(tables[frame, delay])
+    order = _order(tables[frame, delay], better_order)
     left = tables[frame, delay][range(len(order)), order]
     smooth = 1.0
     if old <= STALE and len(delays) > 1:
@@ -132,7 +139,7 @@ def _whole(scores: dict[int, float], best: int) -> bool:
     return abs(vertex) >= LATE
 
 
-def _order(table: Array) -> list[int]:
+def _order(table: Array, factor: float) -> list[int]:
     """Source of every entry: its own, but for cycles that explain their entries far better in another order."""
     count = len(table)
     _, columns = linear_sum_assignment(np.log(table) - 0.05 * np.eye(count))
@@ -144,7 +151,7 @@ def _order(table: Array) -> list[int]:
             cycle.append(start)
             start = int(columns[start])
         there = np.array([np.log(table[i, columns[i]]) for i in cycle])
-        better = len(cycle) > 1 and own[cycle].sum() - there.sum() > len(cycle) * np.log(BETTER_ORDER)
+        better = len(cycle) > 1 and own[cycle].sum() - there.sum() > len(cycle) * np.log(factor)
         if better and np.exp(there).max() < TOLD:
             for i in cycle:
                 order[i] = int(columns[i])

@@ -33,8 +33,17 @@ class State:
         self.run, self.at = run, run.time - late
 
     def channel(self, name: str) -> Array | None:
-        """[K] of a logged channel, interpolated; NaN before the log begins; None where it was not logged."""
+        """[K] of a logged channel, interpolated; NaN before the log begins; None where it was not logged.
+
+        A velocity of a joint that was not logged is the slope of its position.
+        """
         values = self.run.channels.get(name)
+        if (
+            values is None
+            and name.startswith("qvel:")
+            and (place := self.run.channels.get(f"qpos:{name[5:]}")) is not None
+        ):
+            values = np.gradient(place, self.run.rows)
         if values is None or np.isfinite(values).sum() < 2:
             return None
         good = np.isfinite(values)

@@ -43,6 +43,10 @@ SENTENCES = {
     "golden_manifest": "this machine's answers differ from the golden pairs by {found}",
     "golden_given": "the given pairs differ from the file's answers by {found}",
 }
+MOTION = {
+    "order": "order of the drives: {entries} follow the commands of {found}",
+    "sign": "moves against its command",
+}
 FRAMES = {
     "world": "the world's axes", "body": "the body's axes", "inverse": "axes turned by the inverse rotation",
     "order": "axes of a quaternion read in another order",
@@ -58,6 +62,12 @@ NOTES = {
     "no_actions": "no actions in the log: the policy's answers are not compared",
     "no_observations": "no complete observation in the log: the policy's answers are not compared",
     "no_commands": "no commands in the log (ctrl:<actuator>): scale, offset and order of commands cannot be told",
+    "rebuilt": "no observations in the log: the actions follow from the logged state as the manifest says",
+    "rebuilt_unlike": (
+        "no observations in the log, and the actions do not follow from the logged state by any single mistake that was "
+        "tried: noise, several mistakes, or another policy; log what the policy sees (observation:<name>)"
+    ),
+    "not_rebuilt": "no observations in the log, and its state does not give all of them: log observation:<name>",
     "no_scale": "commands are no multiples of the actions: they are not compared",
     "log_is_normalised": "the log holds normalised observations; the actions fit them",
 }
@@ -68,6 +78,8 @@ def sentence(finding: Finding) -> str:
     found, expected = finding.found, finding.expected
     kind = "early" if finding.kind == "delay" and float(found or 0) < 0 else finding.kind
     shown = abs(found) if kind in ("early", "delay", "scale") and isinstance(found, float) else found
+    if finding.part == "motion":
+        return MOTION[kind].format(entries=listed(finding.entries, most=MOST), found=found)
     return SENTENCES[kind].format(
         found=_text(shown),
         expected=_text(expected),
@@ -111,7 +123,9 @@ def verdict(result: Result) -> str:
         n = len(result.findings)
         return f"{n} thing{'s' if n > 1 else ''} of the deployed policy differ{'' if n > 1 else 's'} from the contract"
     if not any(result.compared.get(part) for part in ("observation", "action", "command")):
-        return "nothing could be compared"
+        return "nothing of observations, actions and commands could be compared"
+    if "rebuilt_unlike" in result.notes:
+        return "the log does not show whether the policy is deployed as its contract says"
     return "the deployed policy is as its contract says, in all that the log shows"
 
 

@@ -116,6 +116,7 @@ def _contract(policy: Policy, env: Env) -> dict[str, Any]:
     limited, span = env.mj_model.actuator_ctrllimited.astype(bool), env.mj_model.actuator_ctrlrange
     facts: dict[str, Any] = {
         "observation_clip": limit,
+        "command_joint": [_target(env.mj_model, i) for i in range(env.mj_model.nu)],
         "command_range": [list(map(float, r)) if own else None for own, r in zip(limited, span, strict=True)],
     }
     if meant is not None and len(meant) == len(names):
@@ -124,6 +125,16 @@ def _contract(policy: Policy, env: Env) -> dict[str, Any]:
         spread = np.sqrt(np.asarray(policy.normalizer.var)) + normalise.EPSILON
         facts |= {"normaliser_mean": np.asarray(policy.normalizer.mean).tolist(), "normaliser_std": spread.tolist()}
     return facts
+
+
+def _target(model: mujoco.MjModel, actuator: int) -> str | None:
+    """Name the joint of which the command is the target (a position drive with gear 1); None for other actuators."""
+    on_joint = int(model.actuator_trntype[actuator]) <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, 1]
+    if not on_joint or gain <= 0 or not np.isclose(bias, -gain) or model.actuator_gear[actuator, 0] != 1:
+        return None
+    joint = int(model.actuator_trnid[actuator, 0])
+    return mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"{joint}"
 
 
 def golden_inputs(policy: Policy, env: Env, count: int = GOLDEN) -> dict[str, jax.Array]:

@@ -310,7 +310,7 @@ def _episode(
         obs = code.observe(seen)
         action = code.act(obs)
         command = code.command(action)
-        robot.data.ctrl[:] = command
+        robot.data.ctrl[:] = cables(command, code)
         logged = {"observation": obs, "action": action, "ctrl": command, "task": code.target}
 
         def write(later: float, seen: dict | None = None, t: float = t, logged: dict = logged) -> None:
@@ -332,6 +332,18 @@ def _episode(
         robot.wait(step, write if how.get("rows", 1) > 1 else None, how.get("rows", 1))
         t += step * (1 + how.get("clock", 0.0)) + 0.02 * dt * rng.normal() * (how.get("jitter", 0) > 0)
     return rows
+
+
+def cables(command: np.ndarray, code: Code) -> np.ndarray:
+    """What the drives get: cables may be in each other's place, a motor may be mounted the other way round."""
+    out, rest = command.copy(), np.array(code.net.facts.get("action_offset", 0.0))
+    if "cables_swapped" in code.wrong:
+        i, j = code.wrong["cables_swapped"]
+        out[[i, j]] = out[[j, i]]
+    if "motor_reversed" in code.wrong:
+        i = code.wrong["motor_reversed"]
+        out[i] = 2 * rest[i] - out[i]
+    return out
 
 
 def columns(model: mujoco.MjModel, facts: dict[str, Any]) -> dict[str, list[str]]:

@@ -67,6 +67,16 @@ def drive_sign(rng: np.random.Generator) -> tuple[dict[str, Any], Truth]:
     return {"actuator_sign": i}, [("command", "sign", [JOINTS[i]], None)]
 
 
+def cables(rng: np.random.Generator) -> tuple[dict[str, Any], Truth]:
+    i, j = pair(rng, 12)
+    return {"cables_swapped": (i, j)}, [("motion", "order", [JOINTS[i], JOINTS[j]], None)]
+
+
+def motor(rng: np.random.Generator) -> tuple[dict[str, Any], Truth]:
+    i = int(rng.integers(12))
+    return {"motor_reversed": i}, [("motion", "sign", [JOINTS[i]], None)]
+
+
 def drives_swapped(rng: np.random.Generator) -> tuple[dict[str, Any], Truth]:
     i, j = pair(rng, 12)
     return {"actuators_swapped": (i, j)}, [("command", "order", [JOINTS[i], JOINTS[j]], None)]
@@ -202,6 +212,8 @@ MORE: list[tuple[str, str, Plant]] = [
         "Cartpole",
         fixed("unlimited", ("action", "clip_missing", ["slider_to_cart"], None), amount=0.8),
     ),
+    ("cables swapped", "Anymal", cables),
+    ("motor mounted the other way round", "Anymal", motor),
     ("late steps", "Quadcopter", fixed("late_steps", ("clock", "late_steps", [], None), amount=0.2)),
 ]
 RIGHT: list[tuple[str, str, dict[str, Any]]] = [

@@ -112,6 +112,25 @@ def test_a_right_deployment_is_not_accused(noise: float, drop: tuple[str, ...], 
     assert len(result.compared["action"] if drop != ("action",) else result.compared["command"]) == 2
 
 
+STATE_ONLY = ("observation", "action")
+
+
+@pytest.mark.parametrize("case", ["swapped", "hip", "degrees", "world", "pose", "scale", "late"])
+def test_mistakes_are_found_through_the_network_where_no_observation_is_logged(
+    case: str, policy: Path, tmp_path: Path
+) -> None:
+    observation, truth = WRONG[case]
+    robots.write_log(tmp_path / "run.csv", observation, drop=STATE_ONLY)
+    assert found(check(policy, tmp_path)) == {("observation", kind, entries) for kind, entries in truth}
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.03])
+def test_a_right_deployment_of_which_only_the_state_is_logged(noise: float, policy: Path, tmp_path: Path) -> None:
+    robots.write_log(tmp_path / "run.csv", noise=noise, drop=STATE_ONLY)
+    result = check(policy, tmp_path)
+    assert not result.findings and {"rebuilt", "rebuilt_unlike"} & {*result.notes}
+
+
 def test_a_rate_and_steps_that_are_left_out(policy: Path, tmp_path: Path) -> None:
     robots.write_log(tmp_path / "run.csv", dt=0.025)
     (finding,) = check(policy, tmp_path).findings
