@@ -24,6 +24,8 @@ EXACT = 1e-6  # share that float32 and the digits of a log leave
 BETTER = 0.1  # factor by which it has to explain them better than no mistake; a rule of thumb
 ROWS = 600  # rows of each run that are tried: enough to tell mistakes apart; a rule of thumb
 
+# the sign of a source, before the default pose is subtracted or after it
+SIGNS = (lambda x, e: 2 * e.offset - x, lambda x, e: -x)
 Change = tuple[Finding, list[Array]]  # a mistake, and observations [K, S] of each run with it
 
 
@@ -72,7 +74,8 @@ def _changes(evidence: Evidence, runs: Sequence[Run]) -> Iterator[Change]:
     for members in groups(entries):
         own = [entries[i] for i in members]
         for i in members:
-            yield _by(given, "sign", [entries[i]], [i], lambda x, e: 2 * e.offset - x, -1.0)
+            for how in SIGNS:
+                yield _by(given, "sign", [entries[i]], [i], how, -1.0)
         if own[0].kind == "action":
             yield _by(given, "frozen", own, members, lambda x, e: 0 * x, 0.0)
         yield from _of_group(given, own, members)
@@ -80,6 +83,8 @@ def _changes(evidence: Evidence, runs: Sequence[Run]) -> Iterator[Change]:
             for j in members[k + 1 :]:
                 if own[0].kind != "task" and abs(entries[i].weight) == abs(entries[j].weight):
                     yield _swapped(given, entries, i, j)
+                    if entries[i].offset != entries[j].offset:
+                        yield _exchanged(given, entries, i, j)
         for frame in FRAMES if own[0].kind in VECTORS else ():
             changed = _other_frame(runs, given, own, members, frame)
             if changed is not None:
@@ -96,7 +101,8 @@ def _of_group(given: Sequence[Array], own: Sequence[Entry], members: Sequence[in
     """Mistakes of all entries of a group: units, scales, default pose, sign."""
     first = own[0]
     if len(own) > 1:
-        yield _by(given, "sign", own, members, lambda x, e: 2 * e.offset - x, -1.0)
+        for how in SIGNS:
+            yield _by(given, "sign", own, members, how, -1.0)
     for unit, factor in UNITS.get(first.unit, {}).items() if first.kind not in ("action", "sin", "cos") else ():
         yield _by(given, "unit", own, members, lambda x, e, f=factor: f * x, unit, first.unit)
     if abs(abs(first.weight) - 1) > 0.01 and first.source:
@@ -126,6 +132,15 @@ def _swapped(given: Sequence[Array], entries: Sequence[Entry], i: int, j: int) -
         new[:, i] = one.weight * (old[:, j] - two.offset) / two.weight + one.offset
         new[:, j] = two.weight * (old[:, i] - one.offset) / one.weight + two.offset
     return Finding("observation", "order", (one.name, two.name), f"{two.name}, {one.name}", ""), out
+
+
+def _exchanged(given: Sequence[Array], entries: Sequence[Entry], i: int, j: int) -> Change:
+    """Two entries in each other's place, with their weights and offsets."""
+    out = [observation.copy() for observation in given]
+    for new, old in zip(out, given, strict=True):
+        new[:, [i, j]] = old[:, [j, i]]
+    one, two = entries[i].name, entries[j].name
+    return Finding("observation", "order", (one, two), f"{two}, {one}", ""), out
 
 
 def _other_frame(

@@ -64,8 +64,8 @@ NOTES = {
     "no_commands": "no commands in the log (ctrl:<actuator>): scale, offset and order of commands cannot be told",
     "rebuilt": "no observations in the log: the actions follow from the logged state as the manifest says",
     "rebuilt_unlike": (
-        "no observations in the log, and the actions do not follow from the logged state by any single mistake that was "
-        "tried: noise, several mistakes, or another policy; log what the policy sees (observation:<name>)"
+        "no observations in the log, and the actions do not follow from the logged state by any single mistake that "
+        "was tried: noise, several mistakes, or another policy; log what the policy sees (observation:<name>)"
     ),
     "not_rebuilt": "no observations in the log, and its state does not give all of them: log observation:<name>",
     "no_scale": "commands are no multiples of the actions: they are not compared",
