@@ -62,20 +62,20 @@ def _show(result: Any) -> None:
     from rich.table import Table
 
     from bayessim_mjx.contract import words
-    from bayessim_mjx.quantities import count, listed
+    from bayessim_mjx.quantities import listed
 
     console = Console(soft_wrap=True) if not sys.stdout.isatty() else Console()
     if result.findings:
         table = Table(box=None, pad_edge=False, header_style="bold")
-        for title in ("where", "what differs"):
+        for title in ("where", "what differs", "unexplained"):
             table.add_column(title, overflow="fold")
         for finding in result.findings:
-            table.add_row(words.where(finding), words.sentence(finding))
+            table.add_row(words.where(finding), words.sentence(finding), words.evidence(finding))
         console.print(table)
         console.print()
     for part, names in result.compared.items():
         if names:
-            console.print(f"right: {part}, {count(len(names), 'entry').replace('entrys', 'entries')}", highlight=False)
+            console.print(f"right: {words.right(part, names)}", highlight=False)
     reasons: dict[str, list[str]] = {}
     for entry, reason in result.untold.items():
         reasons.setdefault(reason, []).append(entry)

@@ -38,12 +38,9 @@ class State:
         A velocity of a joint that was not logged is the slope of its position.
         """
         values = self.run.channels.get(name)
-        if (
-            values is None
-            and name.startswith("qvel:")
-            and (place := self.run.channels.get(f"qpos:{name[5:]}")) is not None
-        ):
-            values = np.gradient(place, self.run.rows)
+        if values is None and name.startswith("qvel:") and "[" not in name:
+            place = self.run.channels.get(f"qpos:{name[5:]}")
+            values = None if place is None else np.gradient(place, self.run.rows)
         if values is None or np.isfinite(values).sum() < 2:
             return None
         good = np.isfinite(values)

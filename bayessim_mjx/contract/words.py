@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from bayessim_mjx.contract.evidence import Finding, Result
 from bayessim_mjx.quantities import compact, listed, percent
 
 MOST = 4  # names that a sentence lists; more only by their number
 SENTENCES = {
-    "order": "order: {entries} show {found}",
-    "frame": "frame: {entries} in {frame}",
+    "order": "they show {found}",
+    "frame": "in {frame}",
     "axes": "axes are turned by {found}",
     "quaternion_order": "quaternion in the order {found} in place of {expected}",
     "inverse": "quaternion is that of the inverse rotation (conjugate)",
@@ -43,14 +45,16 @@ SENTENCES = {
     "golden_manifest": "this machine's answers differ from the golden pairs by {found}",
     "golden_given": "the given pairs differ from the file's answers by {found}",
 }
+SWAPPED = "swapped"
 MOTION = {
-    "order": "order of the drives: {entries} follow the commands of {found}",
+    "order": "they follow the commands of {found}",
     "sign": "moves against its command",
 }
 FRAMES = {
     "world": "the world's axes", "body": "the body's axes", "inverse": "axes turned by the inverse rotation",
     "order": "axes of a quaternion read in another order",
 }  # fmt: skip
+WHOLE = {"golden": "golden pairs", "clock": "rate of control"}
 WHY = {
     "unknown": "the manifest does not say what it follows from",
     "no_source": "the log has no channel that it follows from",
@@ -78,6 +82,8 @@ def sentence(finding: Finding) -> str:
     found, expected = finding.found, finding.expected
     kind = "early" if finding.kind == "delay" and float(found or 0) < 0 else finding.kind
     shown = abs(found) if kind in ("early", "delay", "scale") and isinstance(found, float) else found
+    if finding.kind == "order" and len(finding.entries) == 2:
+        return SWAPPED if finding.part != "motion" else f"drives {SWAPPED}"
     if finding.part == "motion":
         return MOTION[kind].format(entries=listed(finding.entries, most=MOST), found=found)
     return SENTENCES[kind].format(
@@ -88,6 +94,18 @@ def sentence(finding: Finding) -> str:
         frame=FRAMES.get(str(found), ""),
         pose="subtracted" if finding.part == "observation" else "added",
     )
+
+
+def evidence(finding: Finding) -> str:
+    """How much of the entries' variance is unexplained before and after the finding; "" where it is not known."""
+    if finding.left is None or finding.before is None:
+        return ""
+    return f"{percent(finding.before)} to {percent(finding.left)}"
+
+
+def right(part: str, names: Sequence[str]) -> str:
+    """Write what was compared and is right."""
+    return WHOLE.get(part) or f"{part}, {len(names)} entr{'y' if len(names) == 1 else 'ies'}"
 
 
 def where(finding: Finding) -> str:
