@@ -5,6 +5,7 @@ of the contract: observations are written by hand for each robot, from the senso
 """
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -275,7 +276,8 @@ def record(
             sensors), digits, drop (streams left out), jitter (share of late steps), period (share of the right one).
     """
     rng = np.random.default_rng(seed)
-    folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
     for episode in range(how.get("episodes", 6 if task == "Quadcopter" else 3)):
         robot = Robot(model, seed + 100 * episode, how.get("noise", 0.0))
         code = CODES[task](Net(net), wrong, rng)
