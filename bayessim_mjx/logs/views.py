@@ -151,11 +151,17 @@ def joints(sheets: Sequence[Sheet]) -> list[str]:
 
 
 def velocity(sheet: Sheet, joint: str) -> Array | None:
-    """[T] as measured, else the slope of the position; None without either."""
+    """[T] as measured, else the slope of the position; None without either, and for parts of an orientation.
+
+    Position i of a ball or free joint is a part of its quaternion, and velocity i is none of its rates.
+    """
+    base, index = re.fullmatch(r"(.*?)(?:\[(\d+)\])?", joint).groups()  # type: ignore[union-attr]
+    if index is not None and (int(index) > 2 or f"qpos:{base}[6]" not in sheet.channels):
+        return None
     if f"qvel:{joint}" in sheet.channels:
         return sheet.channels[f"qvel:{joint}"]
     place = sheet.channels.get(f"qpos:{joint}")
-    if place is None or len(place) < 3 or re.search(r"\[\d+\]$", joint):
+    if place is None or len(place) < 3:
         return None
     return np.gradient(place, sheet.time)
 

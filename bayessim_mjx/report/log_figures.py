@@ -115,7 +115,7 @@ def _digits(values: np.ndarray) -> list[float | None]:
     return [float(f"{v:.4g}") if np.isfinite(v) and v > 0 else None for v in values.tolist()]
 
 
-def covered(joint: str, found: Coverage, limits: tuple[float, float] | None) -> dict[str, Any]:
+def covered(joint: str, found: Coverage, limits: tuple[float, float] | None, high: int) -> dict[str, Any]:
     """Rows by position and velocity, dark where there are many; dashed: the ends of the model's range."""
     counts = np.where(found.counts > 0, np.sqrt(found.counts), np.nan)
     middle = [0.5 * (edges[1:] + edges[:-1]) for edges in (found.places, found.speeds)]
@@ -151,7 +151,7 @@ def covered(joint: str, found: Coverage, limits: tuple[float, float] | None) -> 
         "shapes": shapes,
         "margin": margin,
     }
-    return figure(data, COLUMN, 300, least=PHONE, annotations=[heading(text(joint, 40), "x", "y")], **shape)
+    return figure(data, COLUMN, high, least=PHONE, annotations=[heading(text(joint, 40), "x", "y")], **shape)
 
 
 def excited(found: Excitation) -> dict[str, Any]:

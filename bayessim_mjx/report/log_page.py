@@ -24,6 +24,7 @@ POINTS = 400_000  # of all lines over time: a page of about 8 MB, which browsers
 FEWEST, MOST = 120, 1500  # points of one line; a rule of thumb: twice the width of the figure is enough
 PANELS = 240  # figures over time at most; a rule of thumb
 MAPS = 24  # joints with a map of coverage and a spectrum; a rule of thumb
+FEW = 4  # joints whose maps are large; a rule of thumb
 GROUP = 6  # channels of one figure without joints; a rule of thumb
 
 
@@ -78,10 +79,12 @@ def _tiles(sheets: Sequence[Sheet]) -> list[dict[str, str]]:
     rows = sum(len(s.time) for s in sheets)
     late = float(np.mean(steps > 1.5 * step))
     usual = steps[np.abs(steps / step - 1) < 0.9]
+    jitter = float(np.std(usual))
+    jitter = jitter if jitter > 1e-6 * step else 0.0  # below, it is that of floating point
     return [
         {"words": "rows", "value": compact(rows), "unit": ""},
         {"words": "rate", "value": compact(1 / step), "unit": "Hz"},
-        {"words": "jitter (sd)", "value": compact(1e3 * float(np.std(usual)), 2), "unit": "ms"},
+        {"words": "jitter (sd)", "value": compact(1e3 * jitter, 2), "unit": "ms"},
         {"words": "late rows", "value": percent(late), "unit": ""},
     ]
 
@@ -145,7 +148,7 @@ def _coverage(shown: View, joints: Sequence[str]) -> dict[str, Any]:
         if found is None:
             continue
         if len(maps) < MAPS:
-            maps.append(log_figures.covered(joint, found, limits))
+            maps.append(log_figures.covered(joint, found, limits, 300 if len(joints) <= FEW else 220))
         span = f"{compact(found.low, 3)} to {compact(found.high, 3)}"
         share = percent(found.range_share) if found.range_share is not None else "–"
         rows.append((joint, span, share, compact(found.fastest, 3), percent(found.rest), str(found.turns)))

@@ -46,6 +46,14 @@ def test_coverage_of_a_sine() -> None:
     assert found.rest == pytest.approx(2 / np.pi * np.arcsin(0.02), abs=0.01)
 
 
+def test_parts_of_an_orientation_have_no_velocity_of_their_own() -> None:
+    base = {f"qpos:root[{i}]": np.sin(T) for i in range(7)} | {f"qvel:root[{i}]": np.cos(T) for i in range(6)}
+    own = Sheet("run.csv", T, base)
+    assert views.velocity(own, "root[2]") is not None and views.velocity(own, "root[3]") is None
+    ball = Sheet("run.csv", T, {f"qpos:ball[{i}]": np.sin(T) for i in range(4)} | {"qvel:ball[0]": np.cos(T)})
+    assert views.velocity(ball, "ball[0]") is None
+
+
 def test_a_joint_follows_its_own_command() -> None:
     rng = np.random.default_rng(1)
     one, two = np.cumsum(rng.normal(size=(2, len(T))), axis=1) * 0.1
