@@ -5,7 +5,6 @@ of the contract: observations are written by hand for each robot, from the senso
 """
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +25,19 @@ def turn(quat: np.ndarray) -> np.ndarray:
 class Robot:
     """A robot and its sensors."""
 
-    def __init__(self, model: mujoco.MjModel, seed: int, noise: float) -> None:
+    def __init__(self, model: mujoco.MjModel, seed: int, noise: float, grain: float = 0.0) -> None:
         self.model, self.data, self.rng, self.noise = model, mujoco.MjData(model), np.random.default_rng(seed), noise
+        self.grain = grain  # resolution of the encoders
 
     def read(self) -> dict[str, np.ndarray]:
         """Positions and velocities with noise; quaternions have norm 1."""
         qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
         qpos += self.noise * self.rng.normal(size=qpos.shape)
         qvel += 20 * self.noise * self.rng.normal(size=qvel.shape)
-        if self.model.jnt_type[0] == 0:
+        first = 7 if self.model.jnt_type[0] == 0 else 0
+        if self.grain:
+            qpos[first:] = self.grain * np.round(qpos[first:] / self.grain)
+        if first:
             qpos[3:7] /= np.linalg.norm(qpos[3:7])
         return {"qpos": qpos, "qvel": qvel}
 
@@ -266,76 +269,6 @@ def begin(robot: Robot, task: str, rng: np.random.Generator) -> None:
     mujoco.mj_forward(model, data)
 
 
-def record(
-    folder: Path, task: str, model: mujoco.MjModel, net: Path, wrong: dict[str, Any], how: dict[str, Any], seed: int
-) -> None:
-    """Write logs of one deployment.
-
-    Args:
-        wrong: mistakes. how: of the recording: noise, episodes, seconds, rows (per step), own_noise (of the log's
-            sensors), digits, drop (streams left out), jitter (share of late steps), period (share of the right one).
-    """
-    rng = np.random.default_rng(seed)
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    for episode in range(how.get("episodes", 6 if task == "Quadcopter" else 3)):
-        robot = Robot(model, seed + 100 * episode, how.get("noise", 0.0))
-        code = CODES[task](Net(net), wrong, rng)
-        begin(robot, task, rng)
-        rows = _episode(robot, code, how, wrong, rng)
-        streams = [s for s in ("observation", "action", "ctrl", "qpos", "qvel", "task") if s not in how.get("drop", ())]
-        if task != "Anymal":
-            streams = [s for s in streams if s != "task"]
-        names = columns(model, code.net.facts)
-        header = ["time", *(f"{s}:{n}" for s in streams for n in names[s])]
-        table = np.array([[row["time"], *np.concatenate([row[s] for s in streams])] for row in rows])
-        form = f"%.{how.get('digits', 9)}g"
-        np.savetxt(
-            folder / f"run_{episode}.csv",
-            table,
-            ["%.9g"] + [form] * (len(header) - 1),
-            ",",
-            header=",".join(header),
-            comments="",
-        )
-
-
-def _episode(
-    robot: Robot, code: Code, how: dict[str, Any], wrong: dict[str, Any], rng: np.random.Generator
-) -> list[dict]:
-    dt, rows, t = float(code.net.facts["control_dt"]) * wrong.get("period", 1.0), [], 0.0
-    usual = 1.0 if isinstance(code, Drone) else 4.0  # an untrained policy flies no longer
-    for k in range(round(how.get("seconds", usual) / dt)):
-        if k % 40 == 0:
-            code.target = rng.uniform((-2, -1, -1), (2, 1, 1))
-        seen = robot.read()
-        obs = code.observe(seen)
-        action = code.act(obs)
-        command = code.command(action)
-        robot.data.ctrl[:] = cables(command, code)
-        logged = {"observation": obs, "action": action, "ctrl": command, "task": code.target}
-
-        def write(later: float, seen: dict | None = None, t: float = t, logged: dict = logged) -> None:
-            shown = seen or robot.read()
-            own = how.get("own_noise", 0.0)
-            qpos = shown["qpos"] + own * rng.normal(size=shown["qpos"].shape)
-            rows.append(
-                {
-                    "time": t + later,
-                    **logged,
-                    "qpos": qpos,
-                    "qvel": shown["qvel"] + 20 * own * rng.normal(size=shown["qvel"].shape),
-                }
-            )
-
-        write(0.0, seen)
-        late = rng.random() < max(how.get("jitter", 0.0), wrong.get("late_steps", 0.0))
-        step = dt * (2.0 if late else 1.0)
-        robot.wait(step, write if how.get("rows", 1) > 1 else None, how.get("rows", 1))
-        t += step * (1 + how.get("clock", 0.0)) + 0.02 * dt * rng.normal() * (how.get("jitter", 0) > 0)
-    return rows
-
-
 def cables(command: np.ndarray, code: Code) -> np.ndarray:
     """What the drives get: cables may be in each other's place, a motor may be mounted the other way round."""
     out, rest = command.copy(), np.array(code.net.facts.get("action_offset", 0.0))
@@ -346,17 +279,3 @@ def cables(command: np.ndarray, code: Code) -> np.ndarray:
         i = code.wrong["motor_reversed"]
         out[i] = 2 * rest[i] - out[i]
     return out
-
-
-def columns(model: mujoco.MjModel, facts: dict[str, Any]) -> dict[str, list[str]]:
-    """Names of the columns of each stream."""
-    qpos, qvel = [], []
-    for i in range(model.njnt):
-        name, kind = model.joint(i).name, model.jnt_type[i]
-        qpos += [f"{name}[{k}]" for k in range(7)] if kind == 0 else [name]
-        qvel += [f"{name}[{k}]" for k in range(6)] if kind == 0 else [name]
-    actions = facts["action_names"]
-    return {
-        "observation": facts["observation_names"], "action": actions, "ctrl": actions, "qpos": qpos, "qvel": qvel,
-        "task": ["command_x", "command_y", "command_yaw"],
-    }  # fmt: skip

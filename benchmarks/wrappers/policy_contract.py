@@ -16,6 +16,7 @@ from typing import Any
 
 import deployments as d
 import numpy as np
+from deployment_logs import record
 
 from bayessim_mjx import registry
 from bayessim_mjx.contract.check import check
@@ -239,6 +240,25 @@ RIGHT: list[tuple[str, str, dict[str, Any]]] = [
     ("memory, no state", "Pendulum", {"drop": ("qpos", "qvel"), "noise": 0.002}),
 ]
 
+MORE_RIGHT: list[tuple[str, str, dict[str, Any]]] = [
+    ("encoders of 4096 counts", "Anymal", {"grain": 2 * np.pi / 4096, "own_noise": 0.0005}),
+    ("coarse encoders", "Anymal", {"grain": 2 * np.pi / 512}),
+    ("state of half a step later", "Anymal", {"rows": 4, "state_rows_late": 2}),
+    ("rows lost", "Anymal", {"lost": 0.02, "noise": 0.001}),
+    ("every second step", "Anymal", {"every": 2}),
+    ("flips of the quaternion", "Quadcopter", {"flips": True}),
+    ("velocities in every fourth row", "Anymal", {"gaps": 4}),
+    ("actions before their clip", "Anymal", {"unclipped_in_the_log": True}),
+    ("offsets of 0.015 rad and rad/s", "Anymal", {"bias": 0.015, "noise": 0.001}),
+    ("state and commands alone", "Anymal", {"drop": ("observation", "action")}),
+    (
+        "state and commands with noise",
+        "Anymal",
+        {"drop": ("observation", "action"), "noise": 0.002, "own_noise": 0.002},
+    ),
+    ("state and commands alone", "Cartpole", {"drop": ("observation", "action"), "own_noise": 0.001}),
+]
+
 
 def policies(folder: Path) -> dict[str, tuple[Any, Path, Path]]:
     """{task: (model, the policy's file, another policy's)}; untrained networks whose actions move."""
@@ -305,7 +325,7 @@ def main() -> int:
         how = {"noise": float(rng.choice([0.0, 0.001, 0.003])), "own_noise": float(rng.choice([0.0, 0.001, 0.002]))}
         if args.only in name:
             rows.append(_case(folder / f"{k}", made[task], task, name, wrong, truth, how, 1000 * args.seed + k))
-    for k, (name, task, how) in enumerate([] if args.more else RIGHT):
+    for k, (name, task, how) in enumerate(MORE_RIGHT if args.more else RIGHT):
         if args.only in name:
             rows.append(
                 _case(
@@ -325,7 +345,7 @@ def _case(
     folder: Path, made: Any, task: str, name: str, wrong: dict, truth: Truth, how: dict, seed: int
 ) -> dict[str, Any]:
     model, right, other = made
-    d.record(folder, task, model, other if "other_policy" in wrong else right, wrong, how, seed)
+    record(folder, task, model, other if "other_policy" in wrong else right, wrong, how, seed)
     result = check(right, folder)
     ok = named(result, truth)
     print(f"{'ok ' if ok else 'NO '} {task}: {name} {how}", flush=True)
