@@ -1,4 +1,8 @@
-"""Commands against motion: does each joint go where its own command says? Only of drives whose command is a place."""
+"""Commands against motion: does each joint go where its own command says? Only of drives whose command is a place.
+
+A drive pulls its joint to the target, so that the way of the next steps follows the target, given place and speed:
+dq = a u - b q + c v + e. The share of dq that a target explains beside q, v and e is compared between targets.
+"""
 
 from __future__ import annotations
 
@@ -6,51 +10,76 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.contract.evidence import Evidence, Finding, Result, shifted
-from bayessim_mjx.contract.relate import TOLD, relate
+from bayessim_mjx.contract.relate import order_of
 
 Array = NDArray[np.float64]
-DELAYS = (0, 1, 2, 3, 4)  # steps by which a drive may follow its target
-CLEAR = 4.0  # factor by which another joint's target explains a motion better: legs that touch the ground follow poorly
+DELAYS = (0, 1, 2)  # steps by which a drive may get its target late
+MOVED = 0.08  # share of a joint's way that a target has to explain to be told; with 100 rows chance gives 0.04
+AHEAD = 3  # steps of that way: drives of legs need as long; a rule of thumb
+CLEAR = 4.0  # factor by which another target has to explain more: legs push each other over the ground; a rule of thumb
+ROWS = 100  # rows at least; a rule of thumb
 
 
 def compare(evidence: Evidence, result: Result) -> None:
     """Find drives that move another joint than their own, or against their command."""
     targets, names = evidence.manifest.targets, evidence.manifest.actions
-    channels = [f"qpos:{joint}" for joint in targets]
-    driven = [i for i, c in enumerate(channels) if targets[i] and any(c in run.channels for run in evidence.runs)]
-    if not driven or not evidence.has("ctrl"):
+    runs = [
+        run
+        for run in evidence.runs
+        if all(f"{s}:{joint}" in run.channels for joint in targets if joint for s in ("qpos", "qvel"))
+    ]
+    driven = [i for i, joint in enumerate(targets) if joint]
+    if not driven or not runs or not evidence.has("ctrl"):
         return
-    places, asked = [], []
-    for run in evidence.runs:
-        if not all(channels[i] in run.channels for i in driven):
-            continue
-        places.append(np.stack([np.interp(run.time, run.rows, run.channels[channels[i]]) for i in driven], 1))
-        asked.append(run.ctrl[:, driven])
-    if not places:
-        return
-    seen = np.concatenate(places)
-
-    def reference(frame: str, delay: int) -> Array | None:
-        return None if frame else np.concatenate([shifted(a, delay) for a in asked])
-
-    relation = relate(seen, reference, (), DELAYS, CLEAR)
-    if relation is None:
-        return
-    own = [names[i] for i in driven]
-    moved = [k for k, j in enumerate(relation.order) if j != k]
-    if moved:
-        shown = ", ".join(own[relation.order[k]] for k in moved)
-        result.findings.append(Finding("motion", "order", tuple(own[k] for k in moved), shown, ""))
-    against = tuple(
-        own[k] for k in range(len(own)) if relation.told[k] and _slope(seen[:, k], relation.expected[:, k]) < 0
+    place, speed = (
+        [np.stack([np.interp(r.time, r.rows, r.channels[f"{s}:{targets[i]}"]) for i in driven], 1) for r in runs]
+        for s in ("qpos", "qvel")
     )
+    asked = [run.ctrl[:, driven] for run in runs]
+    best: tuple[float, Array] | None = None
+    for delay in DELAYS:
+        slopes = _explained(place, speed, [shifted(u, delay) for u in asked])
+        if slopes is not None and (best is None or np.abs(slopes).max(1).sum() > best[0]):
+            best = float(np.abs(slopes).max(1).sum()), slopes
+    if best is None:
+        return
+    _judge([names[i] for i in driven], best[1], result)
+
+
+def _judge(own: list[str], slopes: Array, result: Result) -> None:
+    """Make findings of signed shares: in cycles of the order, and of negative signs."""
+    share = np.abs(slopes)
+    order = order_of(np.maximum(1e-6, 1e-2 / np.maximum(share, 1e-4)), CLEAR, np.inf)
+    order = [j if share[i, j] > MOVED and share[order[j], order[order[j]]] > 0 else i for i, j in enumerate(order)]
+    if sorted(order) != list(range(len(own))):  # a cycle of which a part is not clear
+        order = list(range(len(own)))
+    moved = [i for i, j in enumerate(order) if j != i]
+    if moved:
+        shown = ", ".join(own[order[i]] for i in moved)
+        result.findings.append(Finding("motion", "order", tuple(own[i] for i in moved), shown, ""))
+    signs = [slopes[i, j] for i, j in enumerate(order)]
+    against = tuple(own[i] for i, s in enumerate(signs) if s < -MOVED)
     if against:
         result.findings.append(Finding("motion", "sign", against, -1.0, 1.0))
-    bad = {*against, *(own[k] for k in moved)}
-    right = [own[k] for k in range(len(own)) if relation.left[k] < TOLD and own[k] not in bad]
+    right = [own[i] for i, s in enumerate(signs) if s > MOVED and i not in moved]
     result.compared.setdefault("motion", []).extend(right)
 
 
-def _slope(seen: Array, expected: Array) -> float:
-    rows = np.isfinite(seen) & np.isfinite(expected)
-    return float(np.cov(seen[rows], expected[rows])[0, 1])
+def _explained(place: list[Array], speed: list[Array], asked: list[Array]) -> Array | None:
+    """[n, n] share of the way of joint i that target j explains beside place and speed, with its sign."""
+    change = np.concatenate([shifted(q, -AHEAD) - q for q in place])
+    q, v, u = (np.concatenate(x) for x in (place, speed, asked))
+    rows = np.isfinite(change).all(1) & np.isfinite(q).all(1) & np.isfinite(v).all(1) & np.isfinite(u).all(1)
+    if rows.sum() < ROWS:
+        return None
+    change, q, v, u = change[rows], q[rows], v[rows], u[rows]
+    out = np.zeros((q.shape[1], q.shape[1]))
+    for i in range(q.shape[1]):
+        known = np.stack([q[:, i], v[:, i], np.ones(len(q))], 1)
+        basis, _ = np.linalg.qr(known)
+        left = change[:, i] - basis @ (basis.T @ change[:, i])
+        other = u - basis @ (basis.T @ u)
+        sizes = np.sqrt((other**2).sum(0) * (left**2).sum())
+        r = np.divide(other.T @ left, sizes, out=np.zeros(len(sizes)), where=other.std(0) > 1e-4)
+        out[i] = np.sign(r) * r**2
+    return out

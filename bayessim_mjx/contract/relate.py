@@ -60,13 +60,11 @@ def relate(
     reference: Reference,
     frames: Sequence[str],
     delays: Sequence[int] = DELAYS,
-    better_order: float = BETTER_ORDER,
 ) -> Relation | None:
     """Find frame, delay and order; None where no reference can be computed or too few rows are there.
 
     Args:
         seen: [N, g]. reference: gives [N, g] or None. frames: other than that of the manifest.
-        better_order: factor by which another order has to explain the entries better.
     """
     plain = reference("", 0)
     if plain is None:
@@ -89,7 +87,7 @@ def relate(
     frame, delay = _simplest(tables)
     expected = reference(frame, delay)
     assert expected is not None
-    order = _order(tables[frame, delay], better_order)
+    order = order_of(tables[frame, delay])
     left = tables[frame, delay][range(len(order)), order]
     smooth = 1.0
     if old <= STALE and len(delays) > 1:
@@ -139,7 +137,7 @@ def _whole(scores: dict[int, float], best: int) -> bool:
     return abs(vertex) >= LATE
 
 
-def _order(table: Array, factor: float) -> list[int]:
+def order_of(table: Array, factor: float = BETTER_ORDER, told: float = TOLD) -> list[int]:
     """Source of every entry: its own, but for cycles that explain their entries far better in another order."""
     count = len(table)
     _, columns = linear_sum_assignment(np.log(table) - 0.05 * np.eye(count))
@@ -152,7 +150,7 @@ def _order(table: Array, factor: float) -> list[int]:
             start = int(columns[start])
         there = np.array([np.log(table[i, columns[i]]) for i in cycle])
         better = len(cycle) > 1 and own[cycle].sum() - there.sum() > len(cycle) * np.log(factor)
-        if better and np.exp(there).max() < TOLD:
+        if better and np.exp(there).max() < told:
             for i in cycle:
                 order[i] = int(columns[i])
     return order
