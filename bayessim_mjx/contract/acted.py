@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -124,7 +124,7 @@ def _against(evidence: Evidence, result: Result, seen: Array, answers: list[Arra
         return
     entries = [Entry(name, {f"action:{name}": 1.0}, 0.0, "") for name in names]
     capped = _within(seen, whole, limit)
-    relation = relate(capped, lambda frame, d: None if frame else np.concatenate([shifted(a, d) for a in answers]), ())
+    relation = relate(capped, _shifts(answers), ())
     noisy = _noise(seen, whole, limit)
     if relation is None or (float(np.mean(relation.left)) > CLOSE and noisy == 0):
         result.findings.append(Finding("action", "other_policy", (), None, None, _left(seen, whole, limit)))
@@ -138,6 +138,11 @@ def _against(evidence: Evidence, result: Result, seen: Array, answers: list[Arra
     found += _timing("action", relation)
     result.findings += [replace(f, left=float(np.mean(relation.left))) for f in found]
     _limits(result, seen, whole, names, evidence)
+
+
+def _shifts(values: Sequence[Array]) -> Callable[[str, float], Array | None]:
+    """Make the reference of values [K, n] of each run that were delayed by whole steps."""
+    return lambda frame, d: None if frame or d % 1 else np.concatenate([shifted(v, int(d)) for v in values])
 
 
 def _timing(part: str, relation: Relation) -> list[Finding]:
@@ -259,7 +264,7 @@ def commands(evidence: Evidence, result: Result, strict: bool = False) -> None:
         return
     entries = [Entry(n, {f"action:{n}": float(s)}, float(o), "") for n, s, o in zip(names, scale, offset, strict=True)]
     own = _off_the_ends(ctrl)
-    relation = relate(own, lambda frame, d: None if frame else np.concatenate([shifted(m, d) for m in made]), ())
+    relation = relate(own, _shifts(made), ())
     if relation is None:
         result.notes.append("no_commands")
         return

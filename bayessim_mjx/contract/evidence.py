@@ -107,7 +107,7 @@ class Evidence:
 
     def reference(
         self, entries: Sequence[Entry], actions: Sequence[Array] | None = None
-    ) -> Callable[[str, int], Array | None]:
+    ) -> Callable[[str, float], Array | None]:
         """Make the function (frame, steps of delay) -> [N, g] of what the manifest expects of entries.
 
         Args:
@@ -115,7 +115,7 @@ class Evidence:
         """
         fed = self.acted if actions is None else actions
 
-        def computed(frame: str, delay: int) -> Array | None:
+        def computed(frame: str, delay: float) -> Array | None:
             if frame and frame in _own_frames(entries):
                 return None
             blocks = []
@@ -131,11 +131,11 @@ class Evidence:
 
         return computed
 
-    def _entry(self, run: Run, acted: Array, entry: Entry, frame: str, delay: int) -> Array | None:
+    def _entry(self, run: Run, acted: Array, entry: Entry, frame: str, delay: float) -> Array | None:
         if entry.terms and all(name.startswith("action:") for name in entry.terms):
-            if frame:
+            if frame or delay % 1:
                 return None
-            before = shifted(acted, 1 + delay)
+            before = shifted(acted, 1 + int(delay))
             columns = [w * before[:, self.manifest.actions.index(n[7:])] for n, w in entry.terms.items()]
             return np.sum(columns, axis=0) + entry.offset
         return State(run, delay * run.period).entry(entry, frame)

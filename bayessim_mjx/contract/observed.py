@@ -96,14 +96,14 @@ def _group(evidence: Evidence, result: Result, entries: list[Entry], seen: Array
 
 
 def _fed_back(evidence, entries, seen, relation, delays, reference):  # type: ignore[no-untyped-def]
-    """Try the file's own answers as previous actions, where what was logged does not explain them."""
-    if relation is not None and relation.told.all() and float(np.mean(relation.left)) < OTHER:
-        return relation, reference
-    other = evidence.reference(entries, evidence.answers)
-    second = relate(seen, other, (), delays)
-    if second is None or (relation is not None and np.mean(second.left) > 0.5 * np.mean(relation.left)):
-        return relation, reference
-    return second, other
+    """Try actions within their limits, and the file's own answers, where what was logged explains less."""
+    limit = evidence.manifest.action_limit
+    for fed in ([np.clip(a, -limit, limit) for a in evidence.acted], evidence.answers):
+        other = evidence.reference(entries, fed)
+        second = relate(seen, other, (), delays)
+        if second is not None and (relation is None or np.mean(second.left) < 0.5 * np.mean(relation.left)):
+            relation, reference = second, other
+    return relation, reference
 
 
 def _commands_back(evidence: Evidence, seen: Array, entries: Sequence[Entry]) -> bool:

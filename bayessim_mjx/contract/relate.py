@@ -20,7 +20,9 @@ DELAYS = (-1, 0, 1, 2, 3, 4)  # steps, candidates
 ROWS = 12  # rows that a relation needs at least; a rule of thumb
 STALE = 0.05  # share of steps with an old value that counts: networks lose one in a hundred; a rule of thumb
 
-Reference = Callable[[str, int], "Array | None"]  # (frame, steps of delay) -> [N, g]
+PARTS = (0.25, 0.5, 0.75)  # of a step: a log is written a part of a step after a measurement
+FLAT = 5.0  # degrees, of a turn of axes that is none; a rule of thumb
+Reference = Callable[[str, float], "Array | None"]  # (frame, steps of delay) -> [N, g]
 
 
 @dataclass(frozen=True)
@@ -94,13 +96,35 @@ def relate(
         first = reference(frame, 0)
         assert first is not None
         smooth = _filtered(seen, first[:, order], left)
-        if smooth < 1.0:
-            delay, expected = 0, filtered(first, smooth)
+        passed = filtered(first, smooth)
+        after = _own(seen, passed[:, order])
+        if smooth < 1.0 and not _between(seen, reference, frame, order, after):
+            delay, expected, left = 0, passed, after
+        else:
+            smooth = 1.0
     expected = expected[:, order]
     turn = _turn(seen, expected, left, fresh) if seen.shape[1] == 3 else None
     told = left < TOLD if turn is None else np.ones(3, bool)
     return Relation(frame, delay, tuple(order), left, expected, told, turn, held if old > STALE else 1,
                     old if old > STALE else 0.0, smooth)  # fmt: skip
+
+
+def _own(seen: Array, expected: Array) -> Array:
+    """[g] share of the variance of each entry that a line in its own source leaves."""
+    rows = np.isfinite(seen).all(1) & np.isfinite(expected).all(1)
+    return np.diag(unexplained(seen[rows], expected[rows])) if rows.sum() >= ROWS else np.ones(seen.shape[1])
+
+
+def _between(seen: Array, reference: Reference, frame: str, order: Sequence[int], filtered_: Array) -> bool:
+    """Whether a delay of a part of a step explains the entries about as well as a low-pass filter."""
+    for part in PARTS:
+        expected = reference(frame, part)
+        if expected is None:
+            return False
+        gain = np.log(_own(seen, expected[:, order])).mean() - np.log(np.maximum(filtered_, FLOOR)).mean()
+        if gain < np.log(BETTER_FRAME):
+            return True
+    return False
 
 
 def _score(table: Array) -> Array:
@@ -218,4 +242,5 @@ def _turn(seen: Array, expected: Array, left: Array, fresh: NDArray[np.bool_]) -
     turned = u @ v
     if gain < np.log(BETTER_FRAME) or rest.max() > TOLD or sizes.min() < 0.8 * sizes.max() or np.linalg.det(turned) < 0:
         return None
-    return turned
+    angle = np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)))
+    return turned if angle > FLAT else None

@@ -12,6 +12,7 @@ from bayessim_mjx.contract.recording import Run
 
 Array = NDArray[np.float64]
 FRAMES = ("world", "body", "inverse", "order")  # mistakes: other axes, the inverse rotation, quaternion in other order
+NEXT = 1.5  # row periods between two samples of a channel that follow each other; a rule of thumb
 VECTORS = ("gravity", "turning", "turning_world", "velocity", "velocity_world")
 
 
@@ -44,7 +45,15 @@ class State:
         if values is None or np.isfinite(values).sum() < 2:
             return None
         good = np.isfinite(values)
-        return np.interp(self.at, self.run.rows[good], values[good], left=np.nan)
+        rows = self.run.rows[good]
+        out = np.interp(self.at, rows, values[good], left=np.nan)
+        if good.all():
+            return out
+        # between samples of a sensor that is read less often than the log nothing is known
+        after = np.clip(np.searchsorted(rows, self.at - 1e-9), 1, len(rows) - 1)
+        hit = np.minimum(np.abs(rows[after] - self.at), np.abs(rows[after - 1] - self.at)) < 1e-6
+        close = rows[after] - rows[after - 1] < NEXT * np.median(np.diff(self.run.rows))
+        return np.where(hit | close, out, np.nan)
 
     def _joint(self, stream: str, joint: str, indices: Sequence[int]) -> Array | None:
         """[K, n] of a joint with several numbers."""
