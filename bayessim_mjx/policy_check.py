@@ -10,6 +10,7 @@ from typing import Any
 from bayessim_mjx import cli
 
 DESCRIPTION = "Compare logs of a deployed policy with the file that was exported (docs/export.md)."
+WIDTH = 120  # characters of a line where no terminal says it
 
 
 def _parser() -> cli.PlainParser:
@@ -64,7 +65,7 @@ def _show(result: Any) -> None:
     from bayessim_mjx.contract import words
     from bayessim_mjx.quantities import listed
 
-    console = Console(soft_wrap=True) if not sys.stdout.isatty() else Console()
+    console = Console(width=None if sys.stdout.isatty() else WIDTH)
     if result.findings:
         table = Table(box=None, pad_edge=False, header_style="bold")
         for title in ("where", "what differs", "unexplained"):
