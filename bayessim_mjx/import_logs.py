@@ -1,4 +1,4 @@
-"""`bayessim-mjx logs`: `check DIR` shows how logs are read; `from-mcap FILE --out DIR` and others convert."""
+"""`bayessim-mjx logs`: `check DIR` and `show DIR` look at logs; `from-mcap FILE --out DIR` and others convert."""
 
 import argparse
 import errno
@@ -41,6 +41,7 @@ def _parser() -> cli.PlainParser:
     for name in ("from-mcap", "from-rosbag"):
         _ros(of[name])
     _check(formats, prog)
+    _show(formats, prog)
     of["from-lerobot"].add_argument(
         "--episodes", metavar="N", type=int, nargs="+", help="numbers of the episodes (default: all)"
     )
@@ -59,6 +60,18 @@ def _check(formats: Any, prog: str) -> None:
     parser.add_argument("--model", metavar="FILE", help="MJCF or URDF model; it names joints and actuators")
     cli.of_urdf(parser)
     parser.add_argument("--map", metavar="FILE", help="map of the columns (default: map.yaml in the folder)")
+
+
+def _show(formats: Any, prog: str) -> None:
+    text = "a page of logs: channels, spectra, coverage, what excites what, rates"
+    parser = formats.add_parser("show", help=text, description=f"Write {text}.")
+    parser.usage = f"{prog} show DIR [--model FILE] [--map FILE] [--out FILE] [--mcap FILE]"
+    parser.add_argument("path", metavar="DIR", help="folder of logs, or one file")
+    parser.add_argument("--model", metavar="FILE", help="MJCF or URDF model; it names joints and actuators")
+    cli.of_urdf(parser)
+    parser.add_argument("--map", metavar="FILE", help="map of the columns (default: map.yaml in the folder)")
+    parser.add_argument("--out", metavar="FILE", default="show.html", help="the page (default: show.html)")
+    parser.add_argument("--mcap", metavar="FILE", help="write the logs as MCAP, too, for Foxglove (extra [logs])")
 
 
 def _ros(parser: argparse.ArgumentParser) -> None:
@@ -150,6 +163,8 @@ def _logs(argv: Sequence[str] | None) -> int:
     args = _parser().parse_args(argv)
     if args.format == "check":
         return _checked(args)
+    if args.format == "show":
+        return _shown(args)
     scale, of_commands = _scales(args)
     cli.writable(args.out, "--out")
     from bayessim_mjx.logs.importers.folder import Target
@@ -186,6 +201,23 @@ def _checked(args: argparse.Namespace) -> int:
             " ".join(["nothing is missing; next: bayessim-mjx diagnose --model", args.model, *own, "--data", str(path)])
         )
     return 2 if found.missing else 0
+
+
+def _shown(args: argparse.Namespace) -> int:
+    """Write the page of the logs; exit code 0."""
+    for flag, path in (("--out", args.out), ("--mcap", args.mcap)):
+        if path:
+            cli.writable(Path(path).parent, flag)
+    from bayessim_mjx.logs import mcap_file, views
+    from bayessim_mjx.report import log_page
+
+    shown = views.view(Path(args.path), _model(args), args.map)
+    for what in shown.overview.missing:
+        print(f"missing: {what}")
+    print(f"page: {log_page.write(shown, Path(args.out), Path(args.path).resolve().name)}")
+    if args.mcap:
+        print(f"mcap: {args.mcap}, {mcap_file.write(Path(args.mcap), shown.sheets)} messages")
+    return 0
 
 
 def _write_map(path: Path, text: str) -> None:

@@ -21,9 +21,10 @@ from bayessim_mjx.config import settings
 from bayessim_mjx.tasks.locomotion import Locomotion
 
 ROOT = Path(__file__).parents[1]
-COMMANDS = ("main", "train", "play", "calibrate", "diagnose", "blind", "gap_loop", "logs", "implementations")
+COMMANDS = ("main", "train", "play", "calibrate", "diagnose", "blind", "gap_loop", "logs", "policy", "implementations")
 FORMATS = (
     "check",
+    "show",
     "from-mcap",
     "from-rosbag",
     "from-lerobot",
@@ -35,7 +36,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(p for f in FOLDERS for 
 PYTHON = {"env.reset", "env.step", "env.dt", "env.mj_model", "env.space", "ppo.train"}  # in Python, not settings
 COMMAND = re.compile(
     r"(?:python -m bayessim_mjx\.(\w+)"
-    r"|bayessim-mjx ((?:main|train|play|calibrate|diagnose|blind|gap-loop|logs|implementations)?)"
+    r"|bayessim-mjx ((?:main|train|play|calibrate|diagnose|blind|gap-loop|logs|policy|implementations)?)"
     r"|python ((?:benchmarks|examples|docs)/[\w/]+\.py))([^`\n#&]*)"
 )
 PROSE = re.compile(r"`(main|train|play|calibrate|diagnose|blind|gap_loop|implementations) (--[^`\n]*)`")
@@ -56,7 +57,7 @@ def flags_of(command: str) -> set[str]:
         return set(re.findall(r'"(--[a-z][\w-]*)"', (ROOT / command).read_text())) | {"--help"}
     text = io.StringIO()
     with contextlib.redirect_stdout(text):
-        for first in FORMATS if command == "logs" else ("",):
+        for first in {"logs": FORMATS, "policy": ("check",)}.get(command, ("",)):
             main.main([command, *filter(None, [first]), "--help"])
     return set(re.findall(r"--[a-z][a-z_-]*", text.getvalue()))
 

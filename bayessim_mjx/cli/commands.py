@@ -46,7 +46,7 @@ COMMANDS = {
     ),
     "logs": Command(
         LOGS,
-        "check logs; convert MCAP, ROS bags, LeRobot, HDF5",
+        "check and show logs; convert MCAP, ROS bags, LeRobot, HDF5",
         ("check LOGS --model robot.xml", "from-mcap run.mcap --model robot.xml --out logs"),
         "import_logs",
     ),
@@ -59,6 +59,12 @@ COMMANDS = {
         POLICIES,
         "evaluate, film or export a saved policy",
         ("--task Pendulum --checkpoint best --video", "--task Pendulum --use_pretrained_checkpoint --video"),
+    ),
+    "policy": Command(
+        POLICIES,
+        "compare a deployed policy with the file that was exported",
+        ("check policy.onnx --logs LOGS", "check policy.onnx --logs LOGS --golden robot.json"),
+        "policy_check",
     ),
     "calibrate": Command(
         CHECKS,

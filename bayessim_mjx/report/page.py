@@ -28,44 +28,54 @@ def write(diagnosis: Diagnosis, folder: str | Path, missed: Any = None) -> Path:
 
 def render(d: Diagnosis, missed: Any = None, link: str = "", folder: Path = Path()) -> str:
     """Return the page as text; `link`: to the page of the blind check, from this one; `folder`: of the result."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
 
-    environment = Environment(
+    return (
+        environment()
+        .get_template(TEMPLATE)
+        .render(
+            plotly=Markup(get_plotlyjs()),
+            width=WIDTH,
+            column=COLUMN,
+            stage_names=STAGES,
+            stage_colours=STAGE,
+            verdict=d.verdict,
+            tone=TONES[d.verdict][1],
+            top=sections.top(d, folder),
+            about=sections.about(d),
+            gap=sections.how_far(d),
+            effects=sections.effects(d),
+            candidates=sections.candidates(d),
+            not_fitted=not_fitted(d),
+            where=sections.where(d),
+            overlays=evidence.overlays(d),
+            parameters=evidence.parameters(d),
+            isolability=evidence.isolability(d),
+            flexible=evidence.flexible(d),
+            black_boxes=evidence.black_boxes(d),
+            experiment=evidence.experiment(d),
+            data=evidence.data(d),
+            warnings=d.warnings,
+            missed=missed,
+            missed_link=quote(link) if link else missed and missed.page.as_uri(),
+            versions=d.versions,
+        )
+    )
+
+
+def environment() -> Any:
+    """Make the `jinja2.Environment` of the pages: templates of this folder, with what they share."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    made = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"embed": embed, "page": page}
-    return environment.get_template(TEMPLATE).render(
-        plotly=Markup(get_plotlyjs()),
-        width=WIDTH,
-        column=COLUMN,
-        stage_names=STAGES,
-        stage_colours=STAGE,
-        verdict=d.verdict,
-        tone=TONES[d.verdict][1],
-        top=sections.top(d, folder),
-        about=sections.about(d),
-        gap=sections.how_far(d),
-        effects=sections.effects(d),
-        candidates=sections.candidates(d),
-        not_fitted=not_fitted(d),
-        where=sections.where(d),
-        overlays=evidence.overlays(d),
-        parameters=evidence.parameters(d),
-        isolability=evidence.isolability(d),
-        flexible=evidence.flexible(d),
-        black_boxes=evidence.black_boxes(d),
-        experiment=evidence.experiment(d),
-        data=evidence.data(d),
-        warnings=d.warnings,
-        missed=missed,
-        missed_link=quote(link) if link else missed and missed.page.as_uri(),
-        versions=d.versions,
-    )
+    made.filters |= {"embed": embed, "page": page}
+    return made
 
 
 def embed(value: Any) -> Markup:

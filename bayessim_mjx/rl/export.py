@@ -20,9 +20,9 @@ import numpy as np
 from bayessim_mjx import versions
 from bayessim_mjx.env import Env, Task
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.rl import recurrent
+from bayessim_mjx.rl import meaning, normalise, recurrent
 from bayessim_mjx.rl.networks import Policy
-from bayessim_mjx.rl.onnx_graph import Graph, network
+from bayessim_mjx.rl.onnx_graph import Graph, network, observation_limit
 
 OPSET, IR_VERSION = 17, 8  # of 2022: every runtime since reads it
 GOLDEN = 8  # observations with the policy's answers, for a check on the target machine
@@ -88,7 +88,10 @@ def onnx_model(policy: Policy, env: Env, notes: Mapping[str, Any] | None = None)
 
 def metadata(policy: Policy, env: Env) -> dict[str, Any]:
     """Describe the inputs and outputs, in their order, with golden pairs of observations and actions."""
-    scaling, golden = command_scale(env, env.action_size - recurrent.memory_size(policy.actor)), golden_inputs(policy)
+    scaling, golden = (
+        command_scale(env, env.action_size - recurrent.memory_size(policy.actor)),
+        golden_inputs(policy, env),
+    )
     facts = {
         "task": env.name,
         "observation_names": list(getattr(env, "observation_names", ())),
@@ -99,18 +102,52 @@ def metadata(policy: Policy, env: Env) -> dict[str, Any]:
         "versions": versions.of(PACKAGES),
         "golden_action": np.asarray(answer(policy, golden)).tolist(),
         **{f"golden_{name}": np.asarray(x).tolist() for name, x in golden.items()},
+        **_contract(policy, env),
     }
     if scaling is not None:
         facts |= {"action_scale": scaling[0].tolist(), "action_offset": scaling[1].tolist()}
     return facts
 
 
-def golden_inputs(policy: Policy, count: int = GOLDEN) -> dict[str, jax.Array]:
-    """Draw inputs [count, ...]: observations spread like those of the training, some far outside; and memories."""
+def _contract(policy: Policy, env: Env) -> dict[str, Any]:
+    """Describe what `policy check` compares: meaning of each observation, limits, normaliser, ranges of commands."""
+    names, meant = list(getattr(env, "observation_names", ())), meaning.of_task(env)
+    limit = observation_limit(env)
+    limited, span = env.mj_model.actuator_ctrllimited.astype(bool), env.mj_model.actuator_ctrlrange
+    facts: dict[str, Any] = {
+        "observation_clip": limit,
+        "command_joint": [_target(env.mj_model, i) for i in range(env.mj_model.nu)],
+        "command_range": [list(map(float, r)) if own else None for own, r in zip(limited, span, strict=True)],
+    }
+    if meant is not None and len(meant) == len(names):
+        facts["observation_meaning"] = meant
+    if policy.normalize:
+        spread = np.sqrt(np.asarray(policy.normalizer.var)) + normalise.EPSILON
+        facts |= {"normaliser_mean": np.asarray(policy.normalizer.mean).tolist(), "normaliser_std": spread.tolist()}
+    return facts
+
+
+def _target(model: mujoco.MjModel, actuator: int) -> str | None:
+    """Name the joint of which the command is the target (a position drive with gear 1); None for other actuators."""
+    on_joint = int(model.actuator_trntype[actuator]) <= int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, 1]
+    if not on_joint or gain <= 0 or not np.isclose(bias, -gain) or model.actuator_gear[actuator, 0] != 1:
+        return None
+    joint = int(model.actuator_trnid[actuator, 0])
+    return mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"{joint}"
+
+
+def golden_inputs(policy: Policy, env: Env, count: int = GOLDEN) -> dict[str, jax.Array]:
+    """Draw inputs [count, ...]: observations spread like those of the training, some far outside; and memories.
+
+    They are within the limit of the task's observations: the file clips them, and the policy alone does not.
+    """
     key, memory_key = jax.random.split(jax.random.PRNGKey(0))
     noise = jax.random.normal(key, (count, policy.normalizer.mean.shape[0]))
     factor = jnp.where(jnp.arange(count) % 4 == 3, 20.0, 1.0)[:, None]
-    inputs = {"observation": policy.normalizer.mean + factor * noise * jnp.sqrt(policy.normalizer.var)}
+    observation = policy.normalizer.mean + factor * noise * jnp.sqrt(policy.normalizer.var)
+    limit = observation_limit(env)
+    inputs = {"observation": observation if limit is None else jnp.clip(observation, -limit, limit)}
     size = recurrent.memory_size(policy.actor)
     return inputs | ({"memory": jax.random.uniform(memory_key, (count, size), minval=-1)} if size else {})
 
@@ -137,7 +174,7 @@ def write(path: Path, policy: Policy, env: Env, notes: Mapping[str, Any] | None 
     data = onnx_model(policy, env, notes).SerializeToString()
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
-    inputs = golden_inputs(policy)
+    inputs = golden_inputs(policy, env)
     return difference(path, inputs, answer(policy, inputs))
 
 

@@ -77,7 +77,7 @@ def write(
 
 def card(policy: Policy, env: Env, task: str, returns: Mapping[str, Any], command: str = "") -> str:
     """Write the text of README.md: metadata as model hubs read them, returns, and how the file is run."""
-    golden = export.golden_inputs(policy)
+    golden = export.golden_inputs(policy, env)
     zeros = [f'"{name}": np.zeros((1, {x.shape[1]}), np.float32)' for name, x in golden.items()]
     first, episodes = next(iter(returns.values())), len(next(iter(returns.values())))
     rows = [f"| {kind} | {estimate(r.mean(), r.std())} |" for kind, r in returns.items()]

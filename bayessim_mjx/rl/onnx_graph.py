@@ -80,9 +80,14 @@ class Graph:
                 self.then(operation, other)
 
 
+def observation_limit(env: Env) -> float | None:
+    """Return the largest observation that the task shows to its policy; None: there is no limit."""
+    return getattr(env, "observation_clip", {}).get(getattr(env, "variant", ""))
+
+
 def network(graph: Graph, policy: Policy, env: Env, size: int) -> None:
     """Observation -> mean of the raw action."""
-    limit = getattr(env, "observation_clip", {}).get(getattr(env, "variant", ""))
+    limit = observation_limit(env)
     if limit is not None:  # as the task does before the policy sees it
         graph.then("Clip", -limit, limit)
     if policy.normalize:

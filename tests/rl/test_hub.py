@@ -45,7 +45,7 @@ def test_the_code_on_the_card_runs(made, monkeypatch):
     monkeypatch.chdir(folder)
     found = {}
     exec((folder / "README.md").read_text().split("```python\n")[1].split("```")[0], found)
-    zero = {name: 0 * value for name, value in export.golden_inputs(policy, 1).items()}
+    zero = {name: 0 * value for name, value in export.golden_inputs(policy, registry.make("Pendulum"), 1).items()}
     np.testing.assert_allclose(found["action"], jax.device_get(export.answer(policy, zero)), atol=2e-6)
 
 

@@ -1,0 +1,1 @@
+"""The deployment contract: logs of a deployed policy against the manifest that was exported with it."""

@@ -1,0 +1,162 @@
+"""Logs of a deployed policy against its contract: every planted mistake is named, and nothing else."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnxruntime", reason="the extra [export] is not installed")
+pytest.importorskip("onnx", reason="the extra [export] is not installed")
+
+from bayessim_mjx.contract.check import check  # noqa: E402
+from bayessim_mjx.contract.evidence import Result  # noqa: E402
+from tests.contract import robots  # noqa: E402
+from tests.contract.robots import HOME, observe  # noqa: E402
+
+Observe = Callable[[dict[str, np.ndarray], int, np.ndarray], np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return robots.write_policy(tmp_path_factory.mktemp("policy") / "policy.onnx")
+
+
+def found(result: Result) -> set[tuple[str, str, tuple[str, ...]]]:
+    return {(f.part, f.kind, f.entries) for f in result.findings}
+
+
+def changed(where: slice, how: Callable[..., Any]) -> Observe:
+    """The observation with one part computed otherwise."""
+
+    def wrong(m: dict[str, np.ndarray], k: int, last: np.ndarray) -> np.ndarray:
+        seen = observe(m, k, last)
+        seen[where] = how(m, k, seen[where])
+        return seen
+
+    return wrong
+
+
+DRAWN = np.random.default_rng(0)
+GRAVITY, SPIN, PLACES, SPEEDS, LAST = slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 10), slice(10, 12)
+names = lambda part: tuple(robots.NAMES[part])  # noqa: E731
+WRONG: dict[str, tuple[Observe, set]] = {
+    "swapped": (changed(PLACES, lambda m, k, x: (m["q"][k] - HOME)[::-1]), {("order", names(PLACES))}),
+    "hip": (changed(PLACES, lambda m, k, x: x * [-1, 1]), {("sign", ("hip_position",))}),
+    "degrees": (changed(SPIN, lambda m, k, x: np.degrees(x)), {("unit", names(SPIN))}),
+    "world": (changed(GRAVITY, lambda m, k, x: [0, 0, -1]), {("frame", names(GRAVITY))}),
+    "inverse": (changed(GRAVITY, lambda m, k, x: -robots.rotation(m["quat"][k])[:, 2]), {("frame", names(GRAVITY))}),
+    "mount": (changed(SPIN, lambda m, k, x: [-x[1], x[0], x[2]]), {("axes", names(SPIN))}),
+    "pose": (changed(PLACES, lambda m, k, x: m["q"][k]), {("pose_missing", names(PLACES))}),
+    "scale": (changed(SPEEDS, lambda m, k, x: 20 * x), {("scale_missing", names(SPEEDS))}),
+    "twice": (changed(SPEEDS, lambda m, k, x: 0.05 * x), {("scale_twice", names(SPEEDS))}),
+    "late": (changed(SPEEDS, lambda m, k, x: 0.05 * m["v"][max(k - 1, 0)]), {("delay", names(SPEEDS))}),
+    "all late": (lambda m, k, last: observe(m, max(k - 2, 0), np.zeros(2)), set()),
+    "dead": (changed(PLACES, lambda m, k, x: [0.2, x[1]]), {("frozen", ("hip_position",))}),
+    "not fed back": (changed(LAST, lambda m, k, x: 0 * x), {("frozen", names(LAST))}),
+    "command back": (changed(LAST, lambda m, k, x: HOME + 0.5 * x), {("command_fed_back", names(LAST))}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+def test_mistakes_of_observations(case: str, noise: float, policy: Path, tmp_path: Path) -> None:
+    observation, truth = WRONG[case]
+    robots.write_log(tmp_path / "run.csv", observation, noise=noise)
+    got = {(kind, entries) for part, kind, entries in found(check(policy, tmp_path)) if part == "observation"}
+    if case == "all late":  # the groups that follow from the state share their delay
+        assert ("frozen", names(LAST)) in got and any(kind == "delay" for kind, _ in got)
+    else:
+        assert got == truth
+
+
+COMMANDS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], tuple[str, tuple[str, ...]]]] = {
+    "scale": (lambda a: HOME + 0.25 * a, ("scale_twice", robots.JOINTS)),
+    "other scale": (lambda a: HOME + 0.4 * a, ("scale", robots.JOINTS)),
+    "sign": (lambda a: HOME + 0.5 * a * [1, -1], ("sign", ("knee",))),
+    "order": (lambda a: (HOME + 0.5 * a)[::-1], ("order", robots.JOINTS)),
+    "pose": (lambda a: 0.5 * a, ("pose_missing", robots.JOINTS)),
+}
+
+
+@pytest.mark.parametrize("case", COMMANDS)
+def test_mistakes_of_commands(case: str, policy: Path, tmp_path: Path) -> None:
+    command, truth = COMMANDS[case]
+    robots.write_log(tmp_path / "run.csv", command=command)
+    assert found(check(policy, tmp_path)) == {("command", *truth)}
+
+
+@pytest.mark.parametrize(
+    ("acted", "kind"),
+    [
+        (lambda o: np.tanh(o @ robots.weights()), "normaliser_missing"),
+        (lambda o: robots.act((o - 0.1) / 0.6), "normaliser_twice"),
+        (lambda o: np.tanh((o - 0.1) / 0.6 @ robots.weights(7)), "other_policy"),
+        (lambda o: robots.act(o) + 0.1 * DRAWN.normal(size=2), "noise"),
+        (lambda o: np.clip(robots.act(o), -0.5, 0.5), "clip_smaller"),
+    ],
+)
+def test_mistakes_of_actions(acted: Any, kind: str, policy: Path, tmp_path: Path) -> None:
+    robots.write_log(tmp_path / "run.csv", acted=acted)
+    assert (kind, "action") in {(f.kind, f.part) for f in check(policy, tmp_path).findings}
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.03])
+@pytest.mark.parametrize("drop", [(), ("qvel",), ("qpos", "qvel"), ("ctrl",), ("action",)], ids=str)
+def test_a_right_deployment_is_not_accused(noise: float, drop: tuple[str, ...], policy: Path, tmp_path: Path) -> None:
+    for seed in range(2):
+        robots.write_log(tmp_path / f"run{seed}.csv", noise=noise, seed=seed, drop=drop)
+    result = check(policy, tmp_path)
+    assert not result.findings
+    assert len(result.compared["action"] if drop != ("action",) else result.compared["command"]) == 2
+
+
+STATE_ONLY = ("observation", "action")
+
+
+@pytest.mark.parametrize("case", ["swapped", "hip", "degrees", "world", "pose", "scale", "late"])
+def test_mistakes_are_found_through_the_network_where_no_observation_is_logged(
+    case: str, policy: Path, tmp_path: Path
+) -> None:
+    observation, truth = WRONG[case]
+    robots.write_log(tmp_path / "run.csv", observation, drop=STATE_ONLY)
+    assert found(check(policy, tmp_path)) == {("observation", kind, entries) for kind, entries in truth}
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.03])
+def test_a_right_deployment_of_which_only_the_state_is_logged(noise: float, policy: Path, tmp_path: Path) -> None:
+    robots.write_log(tmp_path / "run.csv", noise=noise, drop=STATE_ONLY)
+    result = check(policy, tmp_path)
+    assert not result.findings and {"rebuilt", "rebuilt_unlike"} & {*result.notes}
+
+
+def test_a_rate_and_steps_that_are_left_out(policy: Path, tmp_path: Path) -> None:
+    robots.write_log(tmp_path / "run.csv", dt=0.025)
+    (finding,) = check(policy, tmp_path).findings
+    assert (finding.part, finding.kind) == ("clock", "rate")
+    assert finding.found == pytest.approx(40) and finding.expected == pytest.approx(50)
+
+
+def test_what_does_not_move_cannot_be_told(policy: Path, tmp_path: Path) -> None:
+    still = lambda m, k, last: observe({**m, "q": 0 * m["q"] + HOME}, k, last)  # noqa: E731
+    log = robots.write_log(tmp_path / "run.csv", still)
+    text = log.read_text().splitlines()
+    place = [i for i, n in enumerate(text[0].split(",")) if n in ("qpos:hip", "qpos:knee")]
+    rows = [line.split(",") for line in text[1:]]
+    for row in rows:
+        for i, home in zip(place, HOME, strict=True):
+            row[i] = f"{home}"
+    log.write_text("\n".join([text[0], *(",".join(row) for row in rows)]) + "\n")
+    result = check(policy, tmp_path)
+    assert not result.findings and {result.untold[f"{j}_position"] for j in robots.JOINTS} == {"still"}
+
+
+def test_several_rows_for_each_step(policy: Path, tmp_path: Path) -> None:
+    """A log with four rows for each step of the policy, between which observation and action are held."""
+    log = robots.write_log(tmp_path / "run.csv")
+    head, *lines = log.read_text().splitlines()
+    rows = [f"{0.005 * (4 * k + i):.6g},{line.split(',', 1)[1]}" for k, line in enumerate(lines) for i in range(4)]
+    log.write_text("\n".join([head, *rows]) + "\n")
+    result = check(policy, tmp_path)
+    assert not result.findings and "rate" in result.compared["clock"]
