@@ -111,5 +111,5 @@ class Payload(Effect):
             arm = np.array([own["com_x"], own["com_y"], own["com_z"]])
             load = body.add_body(name=f"{body.name or f'body{i}'}.payload", pos=compiled.body_ipos[i] + arm)
             load.mass, load.ipos, load.inertia = own["mass"], np.zeros(3), np.full(3, 1e-12)
-            load.explicitinertial = True
+            load.explicitinertial, load.gravcomp = True, body.gravcomp  # what carries the link carries its load
         return None
