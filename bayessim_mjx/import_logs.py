@@ -180,8 +180,7 @@ def _checked(args: argparse.Namespace) -> int:
     for what in found.missing:
         print(f"missing: {what}")
     if not found.missing:
-        own = [f"--drive {args.drive}"] if args.drive else []
-        own += [f"--packages {' '.join(args.packages)}"] if args.packages else []
+        own = cli.urdf_words(args.drive, args.packages)
         print(
             " ".join(["nothing is missing; next: bayessim-mjx diagnose --model", args.model, *own, "--data", str(path)])
         )

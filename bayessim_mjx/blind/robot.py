@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from bayessim_mjx import urdf
 from bayessim_mjx.blind.reality.plant import AXIAL, Plant, Rig
 from bayessim_mjx.blind.reality.replay import Replay, Take, geoms_in_touch, strays
 from bayessim_mjx.blind.reality.system import System
@@ -24,8 +25,11 @@ OWN = ("repeat_of", "source")  # metadata that name files
 Load = Callable[[], mujoco.MjSpec]
 
 
-def load_model(path: Path) -> mujoco.MjSpec:
-    """Load the MJCF file as a specification whose elements all have names, without keyframes of another size.
+def load_model(path: Path, drive: str | None = None, packages: Sequence[str] = ()) -> mujoco.MjSpec:
+    """Load a file as a specification whose elements all have names, without keyframes of another size.
+
+    Args:
+        drive, packages: see `urdf`.
 
     Raises:
         UserError: there is no such file, or MuJoCo cannot load it.
@@ -33,7 +37,10 @@ def load_model(path: Path) -> mujoco.MjSpec:
     if not path.is_file():
         raise UserError(f"--model {path}: no such file")
     try:
-        return _named(mujoco.MjSpec.from_file(str(path)))
+        spec = urdf.read(path, packages)
+        if drive is not None:
+            urdf.drive(spec, drive)
+        return _named(spec)
     except ValueError as error:
         raise UserError(f"--model {path}: MuJoCo cannot load it: {error}") from None
 

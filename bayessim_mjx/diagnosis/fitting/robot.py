@@ -53,6 +53,7 @@ class Robot:
         accuracy: {parameter: standard deviation as a share}, of what a data sheet states; rating: {body: kg carried}.
         assumed: those of them whose accuracy nobody stated.
         unlimited: joints whose limits its physics leaves out; rounds: most iterations of its solver (`pruned`).
+        urdf: the URDF file that it was read from, if it was.
     """
 
     mj_model: mujoco.MjModel
@@ -66,6 +67,7 @@ class Robot:
     assumed: frozenset[str] = frozenset()
     unlimited: tuple[int, ...] = ()
     rounds: int | None = None
+    urdf: Path | None = None
 
     def stated(self, accuracy: Sequence[str] = (), payload: Sequence[str] = ()) -> "Robot":
         """With what was said of its data sheet, as `--accuracy` and `--payload` (`data_sheet`)."""
@@ -155,7 +157,8 @@ def of_file(
     spec = _by_mujoco("load", str(path), lambda: urdf.read(path, packages))
     if drive is not None:
         urdf.drive(spec, drive)
-    return _of_spec(spec, str(path), path.stem, parameters)
+    robot = _of_spec(spec, str(path), path.stem, parameters)
+    return dataclasses.replace(robot, urdf=path) if urdf.is_urdf(path) else robot
 
 
 def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path | None) -> Robot:
