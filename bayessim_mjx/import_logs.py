@@ -230,7 +230,7 @@ def _model(args: argparse.Namespace) -> Any:
         return None
     from bayessim_mjx.diagnosis.fitting import robot
 
-    return robot.of_file(args.model, None, args.drive, args.packages).mj_model
+    return robot.names_of(args.model, args.drive, args.packages)
 
 
 main = cli.command(_logs)

@@ -62,7 +62,7 @@ def _freeze_masses(spec: mujoco.MjSpec, nominal: mujoco.MjModel) -> None:
         return
     for body in spec.bodies[1:]:
         if nominal.body_mass[body.id]:
-            _state(body, nominal)
+            state(body, nominal)
     compiler.settotalmass, compiler.balanceinertia, compiler.boundmass, compiler.boundinertia = -1.0, False, 0.0, 0.0
     compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
 
@@ -139,10 +139,10 @@ def explicit(spec: mujoco.MjSpec, body: Any) -> None:
         for other in spec.bodies:
             if len(other.geoms):
                 other.explicitinertial, other.ipos = False, [np.nan, 0, 0]
-    _state(body, model)
+    state(body, model)
 
 
-def _state(body: Any, model: mujoco.MjModel) -> None:
+def state(body: Any, model: mujoco.MjModel) -> None:
     """Give the body the inertial that it has in the compiled model."""
     body.explicitinertial = True
     body.mass, body.inertia = float(model.body_mass[body.id]), model.body_inertia[body.id]

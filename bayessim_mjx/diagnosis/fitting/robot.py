@@ -14,13 +14,14 @@ import numpy as np
 from bayessim_mjx import config, urdf
 from bayessim_mjx.config import foreign
 from bayessim_mjx.diagnosis import data_sheet
-from bayessim_mjx.diagnosis.fitting.simulable import check, contacts, label, one_line, unreached
+from bayessim_mjx.diagnosis.fitting.simulable import check, check_names, contacts, label, one_line, unreached
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
-from bayessim_mjx.parameters import ParameterSpace, elements
+from bayessim_mjx.parameters import Parameter, ParameterSpace, elements
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.native import moved_to_joints
+from bayessim_mjx.physics.visuals import without_meshes, without_visuals
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Task
@@ -54,6 +55,7 @@ class Robot:
         assumed: those of them whose accuracy nobody stated.
         unlimited: joints whose limits its physics leaves out; rounds: most iterations of its solver (`pruned`).
         urdf: the URDF file that it was read from, if it was.
+        lean: the model that is simulated with the options of `mj_model`, where that one has meshes only to look at.
     """
 
     mj_model: mujoco.MjModel
@@ -68,6 +70,7 @@ class Robot:
     unlimited: tuple[int, ...] = ()
     rounds: int | None = None
     urdf: Path | None = None
+    lean: mujoco.MjModel | None = None
 
     def stated(self, accuracy: Sequence[str] = (), payload: Sequence[str] = ()) -> "Robot":
         """With what was said of its data sheet, as `--accuracy` and `--payload` (`data_sheet`)."""
@@ -85,7 +88,8 @@ class Robot:
         self, control_dt: float, effects: Sequence[Effect] = (), space: ParameterSpace | None = None
     ) -> Physics:
         """Return the robot at control steps of `control_dt` s, with `space` in the place of its own parameters."""
-        model = with_timestep(self.mj_model, control_dt)
+        model = self.mj_model if self.lean is None else with_options(self.lean, self.mj_model)
+        model = with_timestep(model, control_dt)
         model.jnt_limited[list(self.unlimited)] = 0
         if self.rounds is not None:
             model.opt.iterations = min(self.rounds, model.opt.iterations)
@@ -116,7 +120,8 @@ def robot_of(source: Source, parameters: str | Path | None = None) -> Robot:
         if parameters is None:
             return source
         space = read_params(parameters, source.mj_model)
-        return dataclasses.replace(source, space=space, accuracy={}, assumed=frozenset())
+        lean = None if any(of_shape(p) for p in space.parameters) else source.lean
+        return dataclasses.replace(source, space=space, accuracy={}, assumed=frozenset(), lean=lean)
     if isinstance(source, mujoco.MjModel):
         name = bytes(source.names).split(b"\0")[0].decode() or "model"
         check(source, name)
@@ -152,13 +157,29 @@ def of_file(
         UserError: the file is missing, MuJoCo cannot load it, it has nothing to diagnose, or MJX lacks a feature.
     """
     path = Path(path)
+    robot = _of_spec(_read(path, drive, packages), str(path), path.stem, parameters)
+    return dataclasses.replace(robot, urdf=path) if urdf.is_urdf(path) else robot
+
+
+def names_of(path: str | Path, drive: str | None = None, packages: Sequence[str] = ()) -> mujoco.MjModel:
+    """Return a model of a file that has its joints and actuators, but no meshes and not its masses.
+
+    Raises:
+        UserError: the file is missing, MuJoCo cannot load it, or it has no joint or actuator.
+    """
+    spec = _read(Path(path), drive, packages)
+    model = _by_mujoco("compile", str(path), lambda: without_meshes(spec))
+    check_names(model, str(path))
+    return model
+
+
+def _read(path: Path, drive: str | None, packages: Sequence[str]) -> mujoco.MjSpec:
     if not path.is_file():
         raise UserError(f"--model {path}: no such file")
-    spec = _by_mujoco("load", str(path), lambda: urdf.read(path, packages))
+    spec: mujoco.MjSpec = _by_mujoco("load", str(path), lambda: urdf.read(path, packages))
     if drive is not None:
         urdf.drive(spec, drive)
-    robot = _of_spec(spec, str(path), path.stem, parameters)
-    return dataclasses.replace(robot, urdf=path) if urdf.is_urdf(path) else robot
+    return spec
 
 
 def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path | None) -> Robot:
@@ -168,8 +189,11 @@ def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     moved_to_joints(spec)
     model = _by_mujoco("compile", source, spec.compile)
-    check(model, source)
-    return Robot(model, spec.copy, None, _space(model, parameters), name)._from_data_sheet(parameters is None)
+    lean = _by_mujoco("compile", source, lambda: without_visuals(spec, model))
+    check(model, source, lean)
+    space = _space(model, parameters)
+    shown = lean is model or any(of_shape(p) for p in space.parameters)
+    return Robot(model, spec.copy, None, space, name, lean=None if shown else lean)._from_data_sheet(parameters is None)
 
 
 def _by_mujoco(does: str, source: str, call: Callable[[], Any]) -> Any:
@@ -177,6 +201,19 @@ def _by_mujoco(does: str, source: str, call: Callable[[], Any]) -> Any:
         return call()
     except ValueError as error:
         raise UserError(f"{source}: MuJoCo cannot {does} it: {one_line(error)}") from None
+
+
+def of_shape(p: Parameter) -> bool:
+    """Whether a parameter is of geoms, or changes a body along the axis of one."""
+    return p.kind in ("geom", "actor") or p.attribute == "length"
+
+
+def with_options(model: mujoco.MjModel, other: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a copy with the options of another one."""
+    model = copy.copy(model)
+    for name in (name for name in dir(other.opt) if not name.startswith("_")):
+        setattr(model.opt, name, getattr(other.opt, name))
+    return model
 
 
 def with_timestep(model: mujoco.MjModel, control_dt: float) -> mujoco.MjModel:

@@ -23,8 +23,8 @@ def one_line(error: Exception) -> str:
     return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
-def check(model: mujoco.MjModel, source: str) -> None:
-    """Refuse a model without motion or commands, and what MJX cannot simulate."""
+def check_names(model: mujoco.MjModel, source: str) -> None:
+    """Refuse a model without motion or commands."""
     if not np.isin(model.jnt_type, AXIAL).any():
         raise UserError(f"{source}: the model has no hinge or slide joint, so there is no motion to compare")
     if not model.nu:
@@ -32,6 +32,11 @@ def check(model: mujoco.MjModel, source: str) -> None:
             f"{source}: the model has no actuator, so the logged commands cannot act on it; allowed: --drive torque "
             "(the logs have efforts), --drive position:KP,KV (they have targets), or --drive FILE.yaml by joint"
         )
+
+
+def check(model: mujoco.MjModel, source: str, lean: mujoco.MjModel | None = None) -> None:
+    """Refuse a model without motion or commands, and what MJX cannot simulate; lean: what it is simulated as."""
+    check_names(model, source)
     step = float(model.opt.timestep)
     if not (math.isfinite(step) and step > 0):
         raise UserError(f"{source}: <option timestep> = {step:g}; allowed: seconds > 0")
@@ -47,7 +52,7 @@ def check(model: mujoco.MjModel, source: str) -> None:
     if why := absent(model):
         raise UserError(f"{source}: MJX does not simulate {why}")
     try:
-        mjx.make_data(mjx.put_model(model, impl="jax"))
+        mjx.make_data(mjx.put_model(model if lean is None else lean, impl="jax"))
     except (NotImplementedError, ValueError, TypeError) as error:
         raise UserError(f"{source}: MJX cannot simulate this model: {one_line(error)}{_remedy(str(error))}") from None
 

@@ -34,11 +34,18 @@ FORCES = {  # effects with a native form, at values that change the motion by se
     "gravity_compensation": {"share": 0.4},
     "gravity_tilt": {"roll": 0.05, "pitch": 0.1},
 }
-CONTACTS = {"contact_friction": {"scale": 0.4}, "contact_compliance": {"softness": 0.8}, "ground_height": {"height": 0.05}}
-# Of an effect's change of the motion (positions over 0.6 s): the same equations in single and double precision differ
-# by 1e-5 of it. Dry friction is a soft constraint in MuJoCo, two timesteps stiff, and exact here; a lag is read at the
-# start of each timestep in MuJoCo, so half a timestep later than its mean over it. Measured: at most 0.011 and 0.041.
-SHARES = {"coulomb_friction": 0.02, "actuator_lag": 0.06}
+CONTACTS = {
+    "contact_friction": {"scale": 0.4},
+    "contact_compliance": {"softness": 0.8},
+    "ground_height": {"height": 0.05},
+}
+# Of an effect's change of the motion (positions over 0.6 s), with the largest measured on the robots below. The same
+# equations in single and double precision: 1e-5, allowed 2e-3; where bodies touch, each hit makes it grow: 0.0033.
+# RK4: our viscous friction is that at the end of a timestep: 0.0057. Dry friction is exact here, but in MuJoCo a soft
+# constraint (two timesteps), which the model's own friction shares and joint limits meet: 0.034. A lag is read at the
+# start of each timestep in MuJoCo, here it is the mean over it, half a timestep earlier: 0.041.
+SHARES = {"coulomb_friction": 0.05, "actuator_lag": 0.06}
+ALLOWED = {"rk4": 1e-2, "contact": 1e-2}
 SAME = 2e-3
 DT, STEPS = 0.01, 60
 
@@ -156,7 +163,8 @@ def test_the_written_model_moves_as_the_corrected_simulator(name, tmp_path):
         lagging = range(mj.nu) if effect.name == "actuator_lag" else ()
         change = np.abs(ours - nominal).max()
         away = np.abs(by_mujoco(there, start, lagging) - ours).max()
-        assert change > 0.01 and away < SHARES.get(effect.name, SAME) * change + 2e-5, (effect.name, change, away)
+        share = SHARES.get(effect.name, ALLOWED.get(name, SAME))
+        assert change > 0.01 and away < share * change + 2e-5, (effect.name, change, away)
         tried += 1
     assert tried >= 11
 

@@ -1,0 +1,65 @@
+"""Models without geoms that only show a robot, as it is simulated, and without meshes, as its names are read."""
+
+import mujoco
+import numpy as np
+
+from bayessim_mjx.effects.support.geoms import collidable
+from bayessim_mjx.parameters.editing import state
+
+_MESH, _RAY = int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtSensor.mjSENS_RANGEFINDER)
+_GEOM, _WRAPS = int(mujoco.mjtObj.mjOBJ_GEOM), (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
+
+
+def idle(model: mujoco.MjModel) -> np.ndarray:
+    """`[ngeom]` bool: geoms that touch nothing, that nothing refers to, and that no fluid carries."""
+    if model.opt.density or model.opt.viscosity or _sensed(model):
+        return np.zeros(model.ngeom, bool)
+    wrapped = model.wrap_objid[np.isin(model.wrap_type, [int(w) for w in _WRAPS])]
+    return ~(collidable(model) | np.isin(np.arange(model.ngeom), wrapped))
+
+
+def _sensed(model: mujoco.MjModel) -> bool:
+    """Whether sensors see geoms."""
+    kinds = model.sensor_objtype, model.sensor_reftype
+    return bool((model.sensor_type == _RAY).any() or any((kind == _GEOM).any() for kind in kinds))
+
+
+def without_visuals(spec: mujoco.MjSpec, model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return the model without its idle geoms, if meshes are among them: masses and inertias to the bit those it has.
+
+    Geoms that remain keep their names, also those that are only counted (`geom7`). A model without such meshes stays
+    as it is, so that its programs and their roundings do.
+
+    Args:
+        spec: it is not changed; model: what it compiles to.
+    """
+    out = idle(model)
+    if not np.any(out & (model.geom_type == _MESH)):
+        return model
+    spec = spec.copy()
+    for body in spec.bodies[1:]:
+        if model.body_mass[body.id]:
+            state(body, model)
+    for i, geom in [(geom.id, geom) for geom in spec.geoms]:  # ids move up as geoms go
+        if out[i]:
+            spec.delete(geom)
+        else:
+            geom.name = geom.name or f"geom{i}"
+    used = {geom.meshname for geom in spec.geoms}
+    for mesh in [mesh for mesh in spec.meshes if mesh.name not in used]:
+        spec.delete(mesh)
+    compiler, auto = spec.compiler, mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    compiler.settotalmass, compiler.balanceinertia, compiler.boundmass, compiler.boundinertia = -1.0, False, 0.0, 0.0
+    compiler.inertiafromgeom = auto
+    return spec.compile()
+
+
+def without_meshes(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a copy with spheres in the place of meshes: names, joints and actuators are right, masses are not."""
+    spec = spec.copy()
+    for geom in spec.geoms:
+        if geom.meshname:
+            geom.type, geom.meshname, geom.size = mujoco.mjtGeom.mjGEOM_SPHERE, "", [0.1, 0.0, 0.0]
+    for shape in (*spec.meshes, *spec.skins):
+        spec.delete(shape)
+    return spec.compile()
