@@ -40,14 +40,9 @@ def without_visuals(spec: mujoco.MjSpec, model: mujoco.MjModel) -> mujoco.MjMode
     for body in spec.bodies[1:]:
         if model.body_mass[body.id]:
             state(body, model)
-    for i, geom in [(geom.id, geom) for geom in spec.geoms]:  # ids move up as geoms go
-        if out[i]:
-            spec.delete(geom)
-        else:
-            geom.name = geom.name or f"geom{i}"
-    used = {geom.meshname for geom in spec.geoms}
-    for mesh in [mesh for mesh in spec.meshes if mesh.name not in used]:
-        spec.delete(mesh)
+    for geom in spec.geoms:
+        geom.name = geom.name or f"geom{geom.id}"
+    spec.compiler.discardvisual = True
     compiler, auto = spec.compiler, mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     compiler.settotalmass, compiler.balanceinertia, compiler.boundmass, compiler.boundinertia = -1.0, False, 0.0, 0.0
     compiler.inertiafromgeom = auto

@@ -148,7 +148,10 @@ def test_the_written_model_moves_as_the_corrected_simulator(name, tmp_path):
     (tmp_path / "robot.xml").write_text(ROBOTS[name])
     robot = of_file(tmp_path / "robot.xml")
     mj, start = robot.mj_model, np.full(robot.mj_model.nq, 0.2)
-    found = stack(mj, FORCES | (CONTACTS if name == "contact" else {}))
+    tries = FORCES | (CONTACTS if name == "contact" else {})
+    if name == "contact":
+        del tries["actuator_lag"]  # a hit that comes half a timestep later throws the arm elsewhere
+    found = stack(mj, tries)
     effects, values = [e for e, _ in found], [v for _, v in found]
     every = moved(robot, effects, values, [(), *((k,) for k in range(len(found)))], start)
     nominal, tried = every[0], 0
