@@ -64,6 +64,9 @@ class Effect(abc.ABC):
     # whether its number is a time by which a signal of its joint is late
     late: ClassVar[bool] = False
     offered: ClassVar[bool] = True  # among all the effects that a diagnosis tries; else only where it is named
+    # whether it draws at random in every control step: its memory is a dict with a "key", which `Physics.world` sets. A
+    # diagnosis does not try it: its simulator is deterministic
+    random: ClassVar[bool] = False
     # for people; where these are empty, `support.words` says something by name and docstring
     noun: ClassVar[str] = ""  # what it is called: "command delay"
     lacks: ClassVar[str] = ""  # after "the simulator lacks", where that is not the noun: "a command delay"

@@ -119,15 +119,26 @@ def kinds_of(effects: str | Sequence[str | type[Effect]]) -> list[type[Effect]]:
     "all", alone or among others: those of the library that are on offer (`offered`).
 
     Raises:
-        UserError: an unknown effect.
+        UserError: an unknown effect, or a random one.
     """
     asked = [effects] if isinstance(effects, str) else effects
     found: list[type[Effect]] = []
     for name in asked:
         kinds = map(library.load, library.names()) if name == "all" else ()
         found += [kind for kind in kinds if kind.offered]
-        found += [] if name == "all" else [library.load(name) if isinstance(name, str) else name]
+        found += [] if name == "all" else [_tried(library.load(name) if isinstance(name, str) else name)]
     return in_order(dict.fromkeys(found))
+
+
+def _tried(kind: type[Effect]) -> type[Effect]:
+    """Refuse what draws at random: a fit compares one deterministic motion with the log."""
+    if kind.random:
+        raise UserError(
+            f"--effects {kind.name}: it is random, and fits are not; `bayessim-mjx logs check` reads it from the columns"
+            " sent:command, received:command, sent:measurement and received:measurement; allowed: actuator_delay and "
+            "sensor_delay, which find the mean"
+        )
+    return kind
 
 
 def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, ...], list[str]]:
