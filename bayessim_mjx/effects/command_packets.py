@@ -31,13 +31,11 @@ class CommandPackets(Effect):
     Attributes:
         law: of d: gamma, uniform or two_point (mean +- jitter, one as often as the other).
         lost: hold: the drive goes on with the last command; zero: it takes the command 0 until the next arrives.
-        high: largest delay and jitter, s, unless `parameters` has another range.
     """
 
     where: str | tuple[str, ...] = "all"
     law: str = "gamma"
     lost: str = "hold"
-    high: float = 0.02
     name: ClassVar[str] = "command_packets"
     kind: ClassVar[str] = "actuator"
     late: ClassVar[bool] = True
@@ -100,9 +98,8 @@ def _obeyed(sent: jax.Array, arrival: jax.Array, obeyed: jax.Array, rows: int) -
     later = jax.lax.cummin(arrival, axis=0, reverse=True)
     until = jnp.concatenate([later[1:], jnp.full_like(arrival[:1], jnp.inf)])
     start = jnp.arange(rows, dtype=jnp.float32)[:, None, None]
-    share = jnp.clip(
-        jnp.minimum(until, start + 1.0) - jnp.maximum(arrival, start), 0.0, 1.0
-    )  # [rows, messages, n or 1]
+    share = jnp.minimum(until, start + 1.0) - jnp.maximum(arrival, start)  # [rows, messages, n or 1]
+    share = jnp.clip(share, 0.0, 1.0)
     before = jnp.clip(later[0] - start[:, 0], 0.0, 1.0)
     # a row of a message lasts as long as it did when it was sent; its last one goes on
     row = jnp.clip(jnp.floor(start - arrival), 0, rows - 1)

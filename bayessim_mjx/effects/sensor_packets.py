@@ -28,13 +28,11 @@ class SensorPackets(Effect):
     Attributes:
         law: of the delay: gamma, uniform or two_point (mean +- jitter, one as often as the other).
         lost: hold: the last measurement stays; zero: positions and velocities read 0.
-        high: largest delay and jitter, s, unless `parameters` has another range.
     """
 
     where: str | tuple[str, ...] = "all"
     law: str = "gamma"
     lost: str = "hold"
-    high: float = 0.02
     name: ClassVar[str] = "sensor_packets"
     kind: ClassVar[str] = "joint"
     late: ClassVar[bool] = True
@@ -42,9 +40,7 @@ class SensorPackets(Effect):
     offered: ClassVar[bool] = False
     noun: ClassVar[str] = "varying measurement delay and loss"
     lacks: ClassVar[str] = "a varying measurement delay and lost measurements"
-    separates: ClassVar[str] = (
-        "times at which each measurement was sent and received (`sent:measurement`, `received:...`)"
-    )
+    separates: ClassVar[str] = "times at which each measurement was sent and received (`sent:measurement` ...)"
     quantities: ClassVar[tuple[Quantity, ...]] = packets.quantities(0.02)
 
     def __post_init__(self) -> None:
@@ -52,7 +48,7 @@ class SensorPackets(Effect):
         packets.check(self.name, self.law, self.lost)
 
     def init(self, at: Site) -> Any:
-        """{"key"; "history": `[lag, n, 2]` after past control steps, newest last; "age": of what was shown; "fresh"}."""
+        """Return the measurements `[lag, n, 2]` after past control steps, newest last, and the age of the shown one."""
         lag = max(2, packets.slots(self, at))
         return {
             "key": jnp.zeros(2, jnp.uint32),

@@ -134,9 +134,9 @@ def _tried(kind: type[Effect]) -> type[Effect]:
     """Refuse what draws at random: a fit compares one deterministic motion with the log."""
     if kind.random:
         raise UserError(
-            f"--effects {kind.name}: it is random, and fits are not; `bayessim-mjx logs check` reads it from the columns"
-            " sent:command, received:command, sent:measurement and received:measurement; allowed: actuator_delay and "
-            "sensor_delay, which find the mean"
+            f"--effects {kind.name}: it is random, and fits are not; `bayessim-mjx logs check` reads it from the "
+            "columns sent:command, received:command, sent:measurement and received:measurement; allowed: "
+            "actuator_delay and sensor_delay, which find the mean"
         )
     return kind
 

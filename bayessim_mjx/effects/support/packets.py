@@ -50,8 +50,8 @@ def slots(effect: Any, at: Site) -> int:
     count = math.ceil(longest / at.dt - 1e-6) + 1
     if count > SLOTS:
         raise UserError(
-            f"{effect.name}: delays up to {longest:.3g} s are {count} control steps of {at.dt:.3g} s; allowed: {SLOTS}; "
-            "give delay and jitter smaller ranges (parameters: {jitter: {range: [0, ...]}})"
+            f"{effect.name}: delays up to {longest:.3g} s are {count} control steps of {at.dt:.3g} s; "
+            f"allowed: {SLOTS}; give delay and jitter smaller ranges (parameters: {{jitter: {{range: [0, ...]}}}})"
         )
     return count
 
