@@ -1,5 +1,7 @@
 """Models without geoms that only show a robot, as it is simulated, and without meshes, as its names are read."""
 
+import copy
+
 import mujoco
 import numpy as np
 
@@ -58,3 +60,11 @@ def without_meshes(spec: mujoco.MjSpec) -> mujoco.MjModel:
     for shape in (*spec.meshes, *spec.skins):
         spec.delete(shape)
     return spec.compile()
+
+
+def with_options(model: mujoco.MjModel, other: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a copy with the options of another one."""
+    model = copy.copy(model)
+    for name in (name for name in dir(other.opt) if not name.startswith("_")):
+        setattr(model.opt, name, getattr(other.opt, name))
+    return model

@@ -52,7 +52,7 @@ def test_few_messages_are_no_distribution():
 
 
 def checked(tmp_path: Path, columns: dict[str, np.ndarray], capsys: pytest.CaptureFixture) -> str:
-    table = rows()
+    table = rows(400)
     (tmp_path / "logs").mkdir()
     every = np.column_stack([table, *(x[: len(table)] for x in columns.values())])
     write(tmp_path / "logs", every, ",".join([HEADER, *columns]), "run.csv")

@@ -126,19 +126,15 @@ def kinds_of(effects: str | Sequence[str | type[Effect]]) -> list[type[Effect]]:
     for name in asked:
         kinds = map(library.load, library.names()) if name == "all" else ()
         found += [kind for kind in kinds if kind.offered]
-        found += [] if name == "all" else [_tried(library.load(name) if isinstance(name, str) else name)]
-    return in_order(dict.fromkeys(found))
-
-
-def _tried(kind: type[Effect]) -> type[Effect]:
-    """Refuse what draws at random: a fit compares one deterministic motion with the log."""
-    if kind.random:
+        found += [] if name == "all" else [library.load(name) if isinstance(name, str) else name]
+    random = [kind.name for kind in found if kind.random]
+    if random:  # a fit compares one deterministic motion with the log
         raise UserError(
-            f"--effects {kind.name}: it is random, and fits are not; `bayessim-mjx logs check` reads it from the "
+            f"--effects {random[0]}: it is random, and fits are not; `bayessim-mjx logs check` reads it from the "
             "columns sent:command, received:command, sent:measurement and received:measurement; allowed: "
             "actuator_delay and sensor_delay, which find the mean"
         )
-    return kind
+    return in_order(dict.fromkeys(found))
 
 
 def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, ...], list[str]]:

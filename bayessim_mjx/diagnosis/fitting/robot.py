@@ -21,7 +21,7 @@ from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import Parameter, ParameterSpace, elements
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.native import moved_to_joints
-from bayessim_mjx.physics.visuals import without_meshes, without_visuals
+from bayessim_mjx.physics.visuals import with_options, without_meshes, without_visuals
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Task
@@ -206,14 +206,6 @@ def _by_mujoco(does: str, source: str, call: Callable[[], Any]) -> Any:
 def of_shape(p: Parameter) -> bool:
     """Whether a parameter is of geoms, or changes a body along the axis of one."""
     return p.kind in ("geom", "actor") or p.attribute == "length"
-
-
-def with_options(model: mujoco.MjModel, other: mujoco.MjModel) -> mujoco.MjModel:
-    """Return a copy with the options of another one."""
-    model = copy.copy(model)
-    for name in (name for name in dir(other.opt) if not name.startswith("_")):
-        setattr(model.opt, name, getattr(other.opt, name))
-    return model
 
 
 def with_timestep(model: mujoco.MjModel, control_dt: float) -> mujoco.MjModel:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,9 +11,8 @@ import mujoco
 from bayessim_mjx import urdf
 from bayessim_mjx.diagnosis.correction import Found, correction
 from bayessim_mjx.diagnosis.fitting.simulable import one_line
-from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.support import native, storage
-from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.parameters import ParameterSpace
 
 MODEL, URDF = "model_with_effects.xml", "model_with_effects.urdf"
 # what a URDF has elements for: effects, and attributes of recalibrated parameters
@@ -66,17 +65,10 @@ def _write_urdf(
     folder: Path, source: Path, nominal: mujoco.MjModel, model: mujoco.MjModel, found: storage.Correction
 ) -> list[str]:
     (folder / URDF).write_text(urdf.corrected(source, nominal, model), encoding="utf-8")
-    lacks = [*_beyond_urdf(found.effects), *_uncalibrated(found.calibrated)]
+    lacks = [f"{e.name} at {', '.join(e.places())}" for e in found.effects if e.name not in IN_URDF]
+    lacks += [p.name for p in found.calibrated if p.attribute not in CALIBRATED_IN_URDF]
     has = "a URDF has friction and damping of joints and inertias of links"
     return [f"{URDF} leaves out {', '.join(lacks)}: {has}"] if lacks else []
-
-
-def _beyond_urdf(effects: Sequence[Effect]) -> list[str]:
-    return [f"{e.name} at {', '.join(e.places())}" for e in effects if e.name not in IN_URDF]
-
-
-def _uncalibrated(parameters: Sequence[Parameter]) -> list[str]:
-    return [p.name for p in parameters if p.attribute not in CALIBRATED_IN_URDF]
 
 
 def _friction_acting(spec: mujoco.MjSpec) -> mujoco.MjSpec:
