@@ -31,7 +31,7 @@ def read(path: Path, packages: Sequence[str] = ()) -> mujoco.MjSpec:
         ValueError: MuJoCo cannot load it.
     """
     if not is_urdf(path):
-        return mujoco.MjSpec.from_file(str(path))
+        return mujoco.MjSpec.from_file(str(path.absolute()))  # so that its folder is known
     text = path.read_text(encoding="utf-8", errors="replace")
     named, folders = _folders(packages)
     above = [*folders, *path.resolve().parents]
@@ -49,6 +49,35 @@ def read(path: Path, packages: Sequence[str] = ()) -> mujoco.MjSpec:
     spec = mujoco.MjSpec.from_string(_with_paths(_PACKAGE.sub(found, text)) if _PACKAGE.search(text) else text)
     spec.modelfiledir = str(path.resolve().parent)
     return spec
+
+
+def load(path: Path, text: str | None = None, packages: Sequence[str] = ()) -> mujoco.MjSpec:
+    """Read a file with the drives that a URDF needs; text: see `drive`.
+
+    Raises:
+        UserError: there is no such file, MuJoCo cannot load it, or see `read` and `drive`.
+    """
+    if not path.is_file():
+        raise UserError(f"--model {path}: no such file")
+    try:
+        spec = read(path, packages)
+    except ValueError as error:
+        lines = "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
+        raise UserError(f"{path}: MuJoCo cannot load it: {lines}") from None
+    if text is not None:
+        drive(spec, text)
+    return spec
+
+
+def check_names(model: mujoco.MjModel, source: str) -> None:
+    """Refuse a model without motion or commands."""
+    if not np.isin(model.jnt_type, [int(kind) for kind in _AXIAL]).any():
+        raise UserError(f"{source}: the model has no hinge or slide joint, so there is no motion to compare")
+    if not model.nu:
+        raise UserError(
+            f"{source}: the model has no actuator, so the logged commands cannot act on it; allowed: --drive torque "
+            "(the logs have efforts), --drive position:KP,KV (they have targets), or --drive FILE.yaml by joint"
+        )
 
 
 def is_urdf(path: Path) -> bool:

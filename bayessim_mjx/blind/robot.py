@@ -34,12 +34,8 @@ def load_model(path: Path, drive: str | None = None, packages: Sequence[str] = (
     Raises:
         UserError: there is no such file, or MuJoCo cannot load it.
     """
-    if not path.is_file():
-        raise UserError(f"--model {path}: no such file")
+    spec = urdf.load(path, drive, packages)
     try:
-        spec = urdf.read(path, packages)
-        if drive is not None:
-            urdf.drive(spec, drive)
         return _named(spec)
     except ValueError as error:
         raise UserError(f"--model {path}: MuJoCo cannot load it: {error}") from None

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.support.geoms import collidable
+from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.parameters.editing import state
 
 _MESH, _RAY = int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtSensor.mjSENS_RANGEFINDER)
@@ -49,6 +50,11 @@ def without_visuals(spec: mujoco.MjSpec, model: mujoco.MjModel) -> mujoco.MjMode
     compiler.settotalmass, compiler.balanceinertia, compiler.boundmass, compiler.boundinertia = -1.0, False, 0.0, 0.0
     compiler.inertiafromgeom = auto
     return spec.compile()
+
+
+def needs_geoms(space: ParameterSpace) -> bool:
+    """Whether a parameter is of geoms, or changes a body along the axis of one."""
+    return any(p.kind in ("geom", "actor") or p.attribute == "length" for p in space.parameters)
 
 
 def without_meshes(spec: mujoco.MjSpec) -> mujoco.MjModel:

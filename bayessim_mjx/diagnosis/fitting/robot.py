@@ -14,14 +14,14 @@ import numpy as np
 from bayessim_mjx import config, urdf
 from bayessim_mjx.config import foreign
 from bayessim_mjx.diagnosis import data_sheet
-from bayessim_mjx.diagnosis.fitting.simulable import check, check_names, contacts, label, one_line, unreached
+from bayessim_mjx.diagnosis.fitting.simulable import check, contacts, label, one_line, unreached
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
-from bayessim_mjx.parameters import Parameter, ParameterSpace, elements
+from bayessim_mjx.parameters import ParameterSpace, elements
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.native import moved_to_joints
-from bayessim_mjx.physics.visuals import with_options, without_meshes, without_visuals
+from bayessim_mjx.physics.visuals import needs_geoms, with_options, without_meshes, without_visuals
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Task
@@ -120,7 +120,7 @@ def robot_of(source: Source, parameters: str | Path | None = None) -> Robot:
         if parameters is None:
             return source
         space = read_params(parameters, source.mj_model)
-        lean = None if any(of_shape(p) for p in space.parameters) else source.lean
+        lean = None if needs_geoms(space) else source.lean
         return dataclasses.replace(source, space=space, accuracy={}, assumed=frozenset(), lean=lean)
     if isinstance(source, mujoco.MjModel):
         name = bytes(source.names).split(b"\0")[0].decode() or "model"
@@ -157,7 +157,7 @@ def of_file(
         UserError: the file is missing, MuJoCo cannot load it, it has nothing to diagnose, or MJX lacks a feature.
     """
     path = Path(path)
-    robot = _of_spec(_read(path, drive, packages), str(path), path.stem, parameters)
+    robot = _of_spec(urdf.load(path, drive, packages), str(path), path.stem, parameters)
     return dataclasses.replace(robot, urdf=path) if urdf.is_urdf(path) else robot
 
 
@@ -167,19 +167,10 @@ def names_of(path: str | Path, drive: str | None = None, packages: Sequence[str]
     Raises:
         UserError: the file is missing, MuJoCo cannot load it, or it has no joint or actuator.
     """
-    spec = _read(Path(path), drive, packages)
+    spec = urdf.load(Path(path), drive, packages)
     model = _by_mujoco("compile", str(path), lambda: without_meshes(spec))
-    check_names(model, str(path))
+    urdf.check_names(model, str(path))
     return model
-
-
-def _read(path: Path, drive: str | None, packages: Sequence[str]) -> mujoco.MjSpec:
-    if not path.is_file():
-        raise UserError(f"--model {path}: no such file")
-    spec: mujoco.MjSpec = _by_mujoco("load", str(path), lambda: urdf.read(path, packages))
-    if drive is not None:
-        urdf.drive(spec, drive)
-    return spec
 
 
 def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path | None) -> Robot:
@@ -192,7 +183,7 @@ def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path
     lean = _by_mujoco("compile", source, lambda: without_visuals(spec, model))
     check(model, source, lean)
     space = _space(model, parameters)
-    shown = lean is model or any(of_shape(p) for p in space.parameters)
+    shown = lean is model or needs_geoms(space)
     return Robot(model, spec.copy, None, space, name, lean=None if shown else lean)._from_data_sheet(parameters is None)
 
 
@@ -201,11 +192,6 @@ def _by_mujoco(does: str, source: str, call: Callable[[], Any]) -> Any:
         return call()
     except ValueError as error:
         raise UserError(f"{source}: MuJoCo cannot {does} it: {one_line(error)}") from None
-
-
-def of_shape(p: Parameter) -> bool:
-    """Whether a parameter is of geoms, or changes a body along the axis of one."""
-    return p.kind in ("geom", "actor") or p.attribute == "length"
 
 
 def with_timestep(model: mujoco.MjModel, control_dt: float) -> mujoco.MjModel:

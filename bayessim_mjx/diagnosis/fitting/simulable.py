@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from bayessim_mjx import urdf
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Physics, mjx
@@ -23,20 +24,9 @@ def one_line(error: Exception) -> str:
     return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
-def check_names(model: mujoco.MjModel, source: str) -> None:
-    """Refuse a model without motion or commands."""
-    if not np.isin(model.jnt_type, AXIAL).any():
-        raise UserError(f"{source}: the model has no hinge or slide joint, so there is no motion to compare")
-    if not model.nu:
-        raise UserError(
-            f"{source}: the model has no actuator, so the logged commands cannot act on it; allowed: --drive torque "
-            "(the logs have efforts), --drive position:KP,KV (they have targets), or --drive FILE.yaml by joint"
-        )
-
-
 def check(model: mujoco.MjModel, source: str, lean: mujoco.MjModel | None = None) -> None:
     """Refuse a model without motion or commands, and what MJX cannot simulate; lean: what it is simulated as."""
-    check_names(model, source)
+    urdf.check_names(model, source)
     step = float(model.opt.timestep)
     if not (math.isfinite(step) and step > 0):
         raise UserError(f"{source}: <option timestep> = {step:g}; allowed: seconds > 0")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import mujoco
 
@@ -58,17 +58,13 @@ def write_outputs(diagnosis: Found, robot: Source, folder: str | Path) -> list[s
     except ValueError as error:
         return [f"{MODEL} does not load, use effects.yaml: {one_line(error)}"]
     said = [f"{MODEL} leaves out {sentence}" for sentence in missing]
-    return said if robot.urdf is None else [*said, *_write_urdf(folder, robot.urdf, source.compile(), model, found)]
-
-
-def _write_urdf(
-    folder: Path, source: Path, nominal: mujoco.MjModel, model: mujoco.MjModel, found: storage.Correction
-) -> list[str]:
-    (folder / URDF).write_text(urdf.corrected(source, nominal, model), encoding="utf-8")
-    lacks = [f"{e.name} at {', '.join(e.places())}" for e in found.effects if e.name not in IN_URDF]
+    if robot.urdf is None:
+        return said
+    (folder / URDF).write_text(urdf.corrected(robot.urdf, source.compile(), model), encoding="utf-8")
+    lacks = [f"{e.name} at {', '.join(e.places())}" for e in effects if e.name not in IN_URDF]
     lacks += [p.name for p in found.calibrated if p.attribute not in CALIBRATED_IN_URDF]
     has = "a URDF has friction and damping of joints and inertias of links"
-    return [f"{URDF} leaves out {', '.join(lacks)}: {has}"] if lacks else []
+    return [*said, *([f"{URDF} leaves out {', '.join(lacks)}: {has}"] if lacks else [])]
 
 
 def _friction_acting(spec: mujoco.MjSpec) -> mujoco.MjSpec:
@@ -91,16 +87,9 @@ def _at_home(spec: mujoco.MjSpec, folder: str) -> mujoco.MjSpec:
     home = Path(folder).resolve()  # "": of a file that was named without its folder
     meshes, textures = spec.meshdir, spec.texturedir
     spec.meshdir, spec.texturedir = str((home / meshes).resolve()), str((home / textures).resolve())
-    for asset in assets:
-        asset.file = _found(asset, home, meshes)
-    for texture in spec.textures:
-        texture.file = _found(texture, home, textures)
+    for asset, below in [*((asset, meshes) for asset in assets), *((texture, textures) for texture in spec.textures)]:
+        # in full where it does not lie in the model's own folder of assets: an attached model's
+        if folder and asset.file and not (home / below / asset.file).is_file():
+            found = [path for path in home.rglob(Path(asset.file).name) if path.match(asset.file)]
+            asset.file = str(found[0]) if len(found) == 1 else asset.file
     return spec
-
-
-def _found(asset: Any, home: Path, below: str) -> str:
-    """Name an asset's file; in full where it does not lie in the model's own folder of assets (an attached model's)."""
-    if not asset.file or (home / below / asset.file).is_file():
-        return str(asset.file)
-    elsewhere = sorted(path for path in home.rglob(Path(asset.file).name) if path.match(asset.file))
-    return str(elsewhere[0]) if len(elsewhere) == 1 else str(asset.file)
