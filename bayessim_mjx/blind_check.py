@@ -34,7 +34,8 @@ def _parser() -> cli.PlainParser:
     )
     robot = parser.group("robot and logs")
     robot.add_argument("--task", metavar="TASK", type=cli.task, help="name of a task, or file.py:Class")
-    robot.add_argument("--model", metavar="FILE", help="an MJCF model with actuated hinge or slide joints")
+    robot.add_argument("--model", metavar="FILE", help="an MJCF or URDF model with hinge or slide joints")
+    cli.of_urdf(robot)
     text = (
         "log files, or folders of them: conditions, commands, rates and noise are taken from them (default: a menu of "
         "motions within the model's limits)"
@@ -73,8 +74,7 @@ def _diagnosis(group: Any) -> None:
 
 
 def _checked(args: argparse.Namespace) -> None:
-    if (args.task is None) == (args.model is None):
-        raise UserError("give one of --task NAME and --model FILE")
+    cli.one_robot(args)
     if args.command and "{out}" not in args.command:
         raise UserError(f"--command {args.command!r}: it has to hold {{out}}, and {{data}} and {{model}} where needed")
     try:
@@ -97,7 +97,7 @@ def _blind(argv: Sequence[str] | None) -> int:
     names = effects_of(args.effects)
     check = Check(
         args.out, args.model or "", args.task or "", tuple(args.data), args.map, names, args.accuracy, args.seed,
-        args.command, tuple(args.more), not args.no_sandbox,
+        args.command, tuple(args.more), not args.no_sandbox, args.drive or "", tuple(args.packages),
     )  # fmt: skip
     seconds = None if args.minutes is None else 60 * args.minutes
     limits = Limits(args.cases, seconds, args.workers)

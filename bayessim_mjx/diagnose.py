@@ -95,10 +95,7 @@ def _output(group: Any) -> None:
 
 
 def _checked(args: argparse.Namespace) -> None:
-    if (args.task is None) == (args.model is None):
-        raise UserError("give one of --task NAME and --model FILE")
-    if args.task and (args.drive or args.packages):
-        raise UserError("--drive and --packages are for --model FILE; a task has its own actuators")
+    cli.one_robot(args)
     if not args.data:
         raise UserError("--data is missing: give files or folders of logs")
     cli.writable(args.out, "--out")

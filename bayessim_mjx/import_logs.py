@@ -195,8 +195,7 @@ def _checked(args: argparse.Namespace) -> int:
     for what in found.missing:
         print(f"missing: {what}")
     if not found.missing:
-        own = [f"--drive {args.drive}"] if args.drive else []
-        own += [f"--packages {' '.join(args.packages)}"] if args.packages else []
+        own = cli.urdf_words(args.drive, args.packages)
         print(
             " ".join(["nothing is missing; next: bayessim-mjx diagnose --model", args.model, *own, "--data", str(path)])
         )
@@ -263,7 +262,7 @@ def _model(args: argparse.Namespace) -> Any:
         return None
     from bayessim_mjx.diagnosis.fitting import robot
 
-    return robot.of_file(args.model, None, args.drive, args.packages).mj_model
+    return robot.names_of(args.model, args.drive, args.packages)
 
 
 main = cli.command(_logs)

@@ -4,8 +4,10 @@ import fnmatch
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mujoco
+import numpy as np
 
 from bayessim_mjx import config
 from bayessim_mjx.errors import UserError
@@ -13,6 +15,8 @@ from bayessim_mjx.parameters.attributes import suggest
 
 ALLOWED = "torque, position:KP, position:KP,KV, velocity:KV, or a YAML file with joint: drive"
 _AXIAL = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+SAME = 1e-9  # of a link's largest inertia: smaller differences are rounding of double precision
+_MOMENTS = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
 _PACKAGE = re.compile(r"package://([^/\"']+)/([^\"']+)")
 
 
@@ -26,9 +30,9 @@ def read(path: Path, packages: Sequence[str] = ()) -> mujoco.MjSpec:
         UserError: no such folder, or a file of a package that is in none of them.
         ValueError: MuJoCo cannot load it.
     """
+    if not is_urdf(path):
+        return mujoco.MjSpec.from_file(str(path.absolute()))  # so that its folder is known
     text = path.read_text(encoding="utf-8", errors="replace")
-    if not _PACKAGE.search(text):
-        return mujoco.MjSpec.from_file(str(path))
     named, folders = _folders(packages)
     above = [*folders, *path.resolve().parents]
 
@@ -42,9 +46,47 @@ def read(path: Path, packages: Sequence[str] = ()) -> mujoco.MjSpec:
             raise UserError(f"--model {path}: {match[0]}: no such file; allowed: --packages {name}=FOLDER")
         return str(here)
 
-    spec = mujoco.MjSpec.from_string(_with_paths(_PACKAGE.sub(found, text)))
+    spec = mujoco.MjSpec.from_string(_with_paths(_PACKAGE.sub(found, text)) if _PACKAGE.search(text) else text)
     spec.modelfiledir = str(path.resolve().parent)
     return spec
+
+
+def load(path: Path, text: str | None = None, packages: Sequence[str] = ()) -> mujoco.MjSpec:
+    """Read a file with the drives that a URDF needs; text: see `drive`.
+
+    Raises:
+        UserError: there is no such file, MuJoCo cannot load it, or see `read` and `drive`.
+    """
+    if not path.is_file():
+        raise UserError(f"--model {path}: no such file")
+    try:
+        spec = read(path, packages)
+    except ValueError as error:
+        lines = "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
+        raise UserError(f"{path}: MuJoCo cannot load it: {lines}") from None
+    if text is not None:
+        drive(spec, text)
+    return spec
+
+
+def check_names(model: mujoco.MjModel, source: str) -> None:
+    """Refuse a model without motion or commands."""
+    if not model.njnt:
+        raise UserError(f"{source}: the model has no joint, so there is no motion to compare")
+    if not model.nu:
+        raise UserError(
+            f"{source}: the model has no actuator, so the logged commands cannot act on it; allowed: --drive torque "
+            "(the logs have efforts), --drive position:KP,KV (they have targets), or --drive FILE.yaml by joint"
+        )
+
+
+def is_urdf(path: Path) -> bool:
+    """Whether the first element of a file is that of a URDF; only its beginning is read."""
+    try:
+        with path.open("rb") as file:
+            return next(ElementTree.iterparse(file, events=("start",)))[1].tag == "robot"
+    except (ElementTree.ParseError, StopIteration):  # MuJoCo says what is wrong with it
+        return False
 
 
 def _with_paths(text: str) -> str:
@@ -124,3 +166,99 @@ def _add(spec: mujoco.MjSpec, joint: str, text: str) -> None:
         actuator.set_to_velocity(gains[0])
     else:
         actuator.set_to_position(gains[0], kv=gains[1] if len(gains) > 1 else 0.0)
+
+
+def corrected(source: Path, nominal: mujoco.MjModel, found: mujoco.MjModel) -> str:
+    """Return the text of a URDF with what differs between two models of it: `<dynamics>` of joints, `<inertial>`.
+
+    A link that MuJoCo fused with others takes the whole difference. Meshes that lie beside the file get their full
+    paths, so that the text may lie elsewhere.
+
+    Args:
+        found: `nominal` with other numbers.
+    """
+    root = ElementTree.parse(source, ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True)))
+    for joint in root.getroot().findall("joint"):
+        _write_dynamics(joint, nominal, found)
+    for link in root.getroot().findall("link"):
+        _write_inertial(link, nominal, found)
+    for mesh in root.iter("mesh"):
+        beside = source.resolve().parent / mesh.get("filename", "")
+        if beside.is_file():
+            mesh.set("filename", str(beside))
+    return ElementTree.tostring(root.getroot(), encoding="unicode") + "\n"
+
+
+def _write_dynamics(joint: ElementTree.Element, nominal: mujoco.MjModel, found: mujoco.MjModel) -> None:
+    name = joint.get("name", "")
+    if name not in {nominal.joint(j).name for j in range(nominal.njnt)}:
+        return
+    before, after = (int(m.joint(name).dofadr[0]) for m in (nominal, found))
+    for attribute, field in (("damping", "dof_damping"), ("friction", "dof_frictionloss")):
+        old, new = getattr(nominal, field)[before], getattr(found, field)[after]
+        if old != new:
+            _child(joint, "dynamics").set(attribute, f"{new:.9g}")
+
+
+def _write_inertial(link: ElementTree.Element, nominal: mujoco.MjModel, found: mujoco.MjModel) -> None:
+    name = link.get("name", "")
+    if name not in {nominal.body(b).name for b in range(nominal.nbody)}:
+        return
+    before = _inertia(nominal, name)
+    change = _inertia(found, name) - before
+    if np.abs(change).max() <= SAME * np.abs(before).max():
+        return
+    own = link.find("inertial")
+    total = change + (before if own is None else _stated(own))  # without one its mass is that of its geometry
+    origin, mass, moments = (_child(_child(link, "inertial"), tag) for tag in ("origin", "mass", "inertia"))
+    heavy, place = total[3, 3], total[3, :3] / total[3, 3]
+    about = total[:3, :3] - heavy * (place @ place * np.eye(3) - np.outer(place, place))
+    origin.attrib |= {"xyz": " ".join(f"{x:.9g}" for x in place), "rpy": "0 0 0"}
+    mass.set("value", f"{heavy:.9g}")
+    moments.attrib |= {key: f"{about[at]:.9g}" for key, at in _MOMENTS.items()}
+
+
+def _stated(inertial: ElementTree.Element) -> np.ndarray:
+    """`[4, 4]` of an `<inertial>`; see `_about_origin`."""
+    origin, mass, moments = (_child(inertial, tag) for tag in ("origin", "mass", "inertia"))
+    own, (place, rpy) = np.zeros((3, 3)), (np.array(origin.get(k, "0 0 0").split(), float) for k in ("xyz", "rpy"))
+    for key, (row, column) in _MOMENTS.items():
+        own[row, column] = own[column, row] = float(moments.get(key, "0"))
+    turn = _turned(rpy)
+    return _about_origin(float(mass.get("value", "0")), place, turn @ own @ turn.T)
+
+
+def _inertia(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """`[4, 4]` of a body; see `_about_origin`."""
+    body, matrix = model.body(name).id, np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, model.body_iquat[body])
+    turn = matrix.reshape(3, 3)
+    own = turn @ np.diag(model.body_inertia[body]) @ turn.T
+    return _about_origin(float(model.body_mass[body]), model.body_ipos[body], own)
+
+
+def _about_origin(mass: float, place: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+    """`[4, 4]`: inertia about the link's origin, mass times place, mass; those of parts of a link add up."""
+    out = np.zeros((4, 4))
+    out[:3, :3] = inertia + mass * (place @ place * np.eye(3) - np.outer(place, place))
+    out[3, :3] = out[:3, 3] = mass * place
+    out[3, 3] = mass
+    return out
+
+
+def _turned(rpy: np.ndarray) -> np.ndarray:
+    """Rz(yaw) Ry(pitch) Rx(roll)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def _child(parent: ElementTree.Element, tag: str) -> ElementTree.Element:
+    """Find the child with this tag; it is made where there is none."""
+    found = parent.find(tag)
+    return ElementTree.SubElement(parent, tag) if found is None else found

@@ -6,6 +6,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import mujoco
+
 from bayessim_mjx import atomic
 from bayessim_mjx import effects as library
 from bayessim_mjx.blind import seal
@@ -38,11 +40,13 @@ class Check:
     """The settings of a blind check.
 
     Attributes:
-        model: path of an MJCF file, or task: name of a task; data: files or folders of logs, () for a menu of motions.
+        model: path of an MJCF or URDF file, or task: name of a task; data: files or folders of logs, () for a menu of
+            motions.
         effects: names of the effects that are hidden, () for all that `diagnose` tries unasked.
         accuracy: of data-sheet values (standard deviation).
         seed: of everything; command: an entry (see `worker.command`), "" for `diagnose`; more: further arguments of it.
         sandbox: whether an entry is kept from reading the truths, where the system can do that.
+        drive, packages: of a URDF, see `urdf`.
     """
 
     out: str
@@ -56,6 +60,8 @@ class Check:
     command: str = ""
     more: tuple[str, ...] = ()
     sandbox: bool = True
+    drive: str = ""
+    packages: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in self.effects:
@@ -150,8 +156,12 @@ class Bench:
 def loader(check: Check) -> Load:
     if check.task:
         return load_task(check.task)
-    load_model(Path(check.model))
-    return lambda: load_model(Path(check.model))
+
+    def load() -> mujoco.MjSpec:
+        return load_model(Path(check.model), check.drive or None, check.packages)
+
+    load()
+    return load
 
 
 @lru_cache(maxsize=1)

@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from bayessim_mjx import urdf
 from bayessim_mjx.blind.reality.plant import AXIAL, Plant, Rig
 from bayessim_mjx.blind.reality.replay import Replay, Take, geoms_in_touch, strays
 from bayessim_mjx.blind.reality.system import System
@@ -24,16 +25,18 @@ OWN = ("repeat_of", "source")  # metadata that name files
 Load = Callable[[], mujoco.MjSpec]
 
 
-def load_model(path: Path) -> mujoco.MjSpec:
-    """Load the MJCF file as a specification whose elements all have names, without keyframes of another size.
+def load_model(path: Path, drive: str | None = None, packages: Sequence[str] = ()) -> mujoco.MjSpec:
+    """Load a file as a specification whose elements all have names, without keyframes of another size.
+
+    Args:
+        drive, packages: see `urdf`.
 
     Raises:
         UserError: there is no such file, or MuJoCo cannot load it.
     """
-    if not path.is_file():
-        raise UserError(f"--model {path}: no such file")
+    spec = urdf.load(path, drive, packages)
     try:
-        return _named(mujoco.MjSpec.from_file(str(path)))
+        return _named(spec)
     except ValueError as error:
         raise UserError(f"--model {path}: MuJoCo cannot load it: {error}") from None
 

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx import atomic, trust
+from bayessim_mjx import atomic, cli, trust
 from bayessim_mjx.blind.cases import ITEM, Item, again, make
 from bayessim_mjx.blind.check import Check, bench, loader
 from bayessim_mjx.blind.process import STOPPED, run
@@ -38,11 +38,19 @@ def command(check: Check, data: Path, out: Path) -> list[str]:
         for name, path in (("{model}", model), ("{data}", str(data)), ("{out}", str(out))):
             words = [w.replace(name, path) for w in words]
         return [str(Path(w).resolve()) if Path(w).is_file() else w for w in words]  # it runs in another folder
-    robot = ["--task", check.task] if check.task else ["--model", model]
+    robot = ["--task", check.task] if check.task else ["--model", model, *_of_urdf(check)]
     accuracy = ["--accuracy", f"{100 * check.accuracy:g}%"]
     own = [sys.executable, "-m", "bayessim_mjx.diagnose", *robot, "--data", str(data), "--out", str(out)]
     named = ["--effects", ",".join(("all", *check.asked))] if check.asked else []
     return [*own, *accuracy, "--seed", "0", "--headless", "--verdict_only", *named, *check.more]
+
+
+def _of_urdf(check: Check) -> list[str]:
+    """Return the flags of a URDF, with full paths: a diagnosis runs in another folder."""
+    parts = [part.rpartition("=") for part in check.packages]
+    packages = [f"{name}{sign}{Path(folder).resolve()}" for name, sign, folder in parts]
+    drive = str(Path(check.drive).resolve()) if Path(check.drive).is_file() else check.drive
+    return cli.urdf_words(drive, packages)
 
 
 def diagnose(check: Check, index: int) -> str:

@@ -153,3 +153,16 @@ def of_urdf(group: Any) -> None:
     group.add_argument("--drive", metavar="KIND", help=text)
     text = "where package://NAME/ of a URDF is: NAME=FOLDER, or a folder of packages (default: above the file)"
     group.add_argument("--packages", metavar="DIR", nargs="+", default=[], help=text)
+
+
+def urdf_words(drive: str | None, packages: Sequence[str]) -> list[str]:
+    """Return the flags of `of_urdf` with these values, for another command."""
+    return [*(["--drive", drive] if drive else []), *(["--packages", *packages] if packages else [])]
+
+
+def one_robot(args: argparse.Namespace) -> None:
+    """Refuse flags that name no robot or two, and those of a URDF with a task."""
+    if (args.task is None) == (args.model is None):
+        raise UserError("give one of --task NAME and --model FILE")
+    if args.task and (args.drive or args.packages):
+        raise UserError("--drive and --packages are for --model FILE; a task has its own actuators")

@@ -7,18 +7,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Protocol
 
-import mujoco
 import numpy as np
 
 from bayessim_mjx import effects as library
 from bayessim_mjx import quantities
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.effects.effect import Effect, Quantity, in_order, layout
-from bayessim_mjx.effects.support import native, storage
+from bayessim_mjx.effects.support import storage
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
@@ -97,15 +94,6 @@ class Found(Protocol):
     def covariance(self) -> dict[str, Any]: ...
     @property
     def details(self) -> dict[str, Any]: ...
-
-
-class Source(Protocol):
-    """What is read of a robot: its known parameters, and what gives a fresh specification of it (None: nothing)."""
-
-    @property
-    def space(self) -> ParameterSpace: ...
-    @property
-    def spec(self) -> Callable[[], mujoco.MjSpec] | None: ...
 
 
 def effects_of(diagnosis: Found) -> tuple[Effect, ...]:
@@ -246,47 +234,3 @@ def correction(diagnosis: Found, space: ParameterSpace) -> storage.Correction:
     """Return the effects found, and those parameters of `space` that were calibrated: the contents of effects.yaml."""
     known = calibrated_of(diagnosis, space).parameters
     return storage.Correction(effects_of(diagnosis), tuple(p for p in known if p not in space.parameters))
-
-
-def write_outputs(diagnosis: Found, robot: Source, folder: str | Path) -> list[str]:
-    """Write effects.yaml and, where the robot has a specification, model_with_effects.xml.
-
-    Returns:
-        One sentence for each thing that the XML leaves out because MuJoCo has no element for it.
-    """
-    folder = Path(folder)
-    found = correction(diagnosis, robot.space)
-    effects, calibrated = found.effects, ParameterSpace(found.calibrated)
-    every = [*calibrated.parameters, *(p for e in effects for p in e.space().parameters)]
-    identified = {p.name: (p.mean, p.sd) for p in every if p.mean is not None and p.sd is not None}
-    storage.write(folder / "effects.yaml", effects, identified, calibrated)
-    if robot.spec is None:
-        return ["model_with_effects.xml is not written: a compiled model has no specification; give its MJCF or MjSpec"]
-    source = robot.spec()
-    spec, missing = native.write_model(source, calibrated, calibrated.nominal, effects)
-    spec = _friction_acting(_at_home(spec, source.modelfiledir))
-    spec.compile()
-    left_out = "".join(f"  {sentence}\n" for sentence in missing)
-    note = f"<!-- Not in this model:\n{left_out.replace('--', '- -')}-->\n" if missing else ""
-    (folder / "model_with_effects.xml").write_text(note + spec.to_xml(), encoding="utf-8")
-    return [f"model_with_effects.xml leaves out {sentence}" for sentence in missing]
-
-
-def _friction_acting(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """Native friction is a constraint: where constraints are off as a whole, all others are now off one by one."""
-    off = mujoco.mjtDisableBit
-    if any(joint.frictionloss > 0 for joint in spec.joints):
-        flags = int(spec.option.disableflags) & ~int(off.mjDSBL_FRICTIONLOSS)
-        if flags & int(off.mjDSBL_CONSTRAINT):
-            others = int(off.mjDSBL_CONTACT) | int(off.mjDSBL_LIMIT) | int(off.mjDSBL_EQUALITY)
-            flags = flags & ~int(off.mjDSBL_CONSTRAINT) | others
-        spec.option.disableflags = flags
-    return spec
-
-
-def _at_home(spec: mujoco.MjSpec, folder: str) -> mujoco.MjSpec:
-    """Return the specification with its meshes and textures where they are, wherever its XML will lie."""
-    if folder:
-        spec.meshdir = str((Path(folder) / spec.meshdir).resolve())
-        spec.texturedir = str((Path(folder) / spec.texturedir).resolve())
-    return spec

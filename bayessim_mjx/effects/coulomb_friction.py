@@ -42,6 +42,9 @@ class CoulombFriction(Effect):
         return memory, dry(at, step, at.values(theta)[:, 0])
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
+        """Native: frictionloss, as stiff as MuJoCo allows (two timesteps): it slips least while it should stick."""
         for joint, own in native(spec, values):
-            add(joint, "frictionloss", own["level"])
+            if own["level"]:
+                add(joint, "frictionloss", own["level"])
+                joint.solref_friction = [2.0 * spec.option.timestep, 1.0]
         return None

@@ -66,6 +66,9 @@ class Effect(abc.ABC):
     late: ClassVar[bool] = False
     floats: ClassVar[bool] = False  # only bodies with a free joint carry it; nothing is said of it where there are none
     offered: ClassVar[bool] = True  # among all the effects that a diagnosis tries; else only where it is named
+    # whether it draws at random in every control step: its memory is a dict with a "key", which `Physics.world` sets. A
+    # diagnosis does not try it: its simulator is deterministic
+    random: ClassVar[bool] = False
     # for people; where these are empty, `support.words` says something by name and docstring
     noun: ClassVar[str] = ""  # what it is called: "command delay"
     lacks: ClassVar[str] = ""  # after "the simulator lacks", where that is not the noun: "a command delay"

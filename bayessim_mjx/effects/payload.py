@@ -11,7 +11,7 @@ import numpy as np
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.bodies import inertial_site, native, with_inertials
 from bayessim_mjx.effects.support.site import Site
-from bayessim_mjx.parameters import geometry
+from bayessim_mjx.parameters import editing, geometry
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -102,14 +102,22 @@ class Payload(Effect):
         return with_inertials(model, at.ids, dict(zip(FIELDS, new, strict=True)))
 
     def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
-        """Native: a body without joints, with that mass and no extent."""
-        places = list(native(spec, values))
-        compiled = spec.copy().compile()
-        for body, i, own in places:
+        """Native: the inertial of link and load together, as `on_model` has it."""
+        for body, i, own in list(native(spec, values)):
             if own["mass"] == 0:
                 continue
-            arm = np.array([own["com_x"], own["com_y"], own["com_z"]])
-            load = body.add_body(name=f"{body.name or f'body{i}'}.payload", pos=compiled.body_ipos[i] + arm)
-            load.mass, load.ipos, load.inertia = own["mass"], np.zeros(3), np.full(3, 1e-12)
-            load.explicitinertial = True
+            model = spec.copy().compile()
+            editing.explicit(spec, body)
+            mass, place, load = model.body_mass[i], model.body_ipos[i], own["mass"]
+            arm, frame = np.array([own["com_x"], own["com_y"], own["com_z"]]), np.zeros(9)
+            mujoco.mju_quat2Mat(frame, model.body_iquat[i])
+            turn = frame.reshape(3, 3)
+            # I + mu (|r|^2 1 - r r^T), mu = m load / (m + load), in the frame of the body
+            spread = mass * load / (mass + load) * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+            moments, axes = np.linalg.eigh(turn @ np.diag(model.body_inertia[i]) @ turn.T + spread)
+            axes[:, 0] *= np.linalg.det(axes)  # a rotation, not a reflection
+            quat = np.zeros(4)
+            mujoco.mju_mat2Quat(quat, axes.ravel())
+            body.mass, body.ipos = mass + load, place + load / (mass + load) * arm
+            body.inertia, body.iquat, body.ialt.type = moments, quat, mujoco.mjtOrientation.mjORIENTATION_QUAT
         return None

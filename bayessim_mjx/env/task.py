@@ -181,7 +181,7 @@ class Task(Env):
         drawn: Drawn | None,
     ) -> State:
         theta = jnp.asarray(self.space.nominal) if theta is None else theta
-        world = self._under_gravity(self.physics.world(theta, qpos, qvel), drawn)
+        world = self._under_gravity(self.physics.world(theta, qpos, qvel, key), drawn)
         world = world.replace(task={"steps": jnp.zeros((), jnp.int32)} | self.start(key, world))
         data, action = self.physics.kinematics(world), jnp.zeros(self.action_size)
         metrics = [*jax.eval_shape(lambda: self.reward(world, world, data, action)[2]), *self._counted(data)]

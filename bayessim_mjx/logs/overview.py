@@ -26,6 +26,7 @@ from bayessim_mjx.logs.pieces import MAX_GAP, SHORT_GAP
 from bayessim_mjx.logs.proposal import Proposal, drives, native, propose
 from bayessim_mjx.logs.read import read_logs, table_of
 from bayessim_mjx.logs.table import Table
+from bayessim_mjx.logs.transport import described
 from bayessim_mjx.logs.vendors import hinges
 
 HEAD = """# Proposed from the names of the columns; look through it, and edit it (docs/logs.md).
@@ -139,6 +140,10 @@ def _one(out: Overview, file: Path, log_map: LogMap, model: mujoco.MjModel | Non
             out.missing.append(str(error))
         return
     sources = _sources(table, log_map)
+    with warnings.catch_warnings(record=True) as said:  # of stamps in another unit
+        warnings.simplefilter("always")
+        out.notes += described(table, sources)
+    out.notes += [str(w.message) for w in said]
     if first:
         used = {str(source.column): name for name, source in sources.items()}
         out.columns += [_column(table, column, used, sources, log_map) for column in table.columns]

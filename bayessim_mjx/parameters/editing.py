@@ -2,7 +2,7 @@
 
 Wherever the compiler can derive a number (masses of geoms, inertias, bounds, inverse weights) it does; this makes
 recompiling the edited spec an independent check of `write`. What the compiler froze from nominal ratios (`dampratio`,
-automatic `springlength`) keeps its nominal number.
+automatic `springlength`, masses under `settotalmass` and its like) keeps its nominal number.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -25,17 +25,12 @@ def edit(parameters: Sequence[Parameter], spec: mujoco.MjSpec, theta: np.ndarray
     """See `ParameterSpace.edit`.
 
     Raises:
-        UserError: if the spec uses `settotalmass` (no single mass could change), or a body to be stretched has frames.
+        UserError: a body to be stretched has frames.
     """
     theta = np.asarray(theta, np.float64)
-    spec = spec.copy()
+    spec = frozen(spec)
     nominal = spec.compile()
     physical = [(p, v) for p, v in zip(parameters, theta, strict=True) if p.kind != "effect"]
-    if spec.compiler.settotalmass > 0 and any(p.attribute in ("mass", "scale") for p, _ in physical):
-        raise UserError(
-            f"compiler settotalmass={spec.compiler.settotalmass:g} rescales all masses; take it out of the MJCF"
-        )
-    _freeze(spec, nominal)
     pairs = _Pairs(nominal)
     for parameter, value in sorted(physical, key=lambda pv: attributes.order(pv[0].attribute)):
         if (parameter.kind, parameter.attribute) in FIELDS:
@@ -46,13 +41,30 @@ def edit(parameters: Sequence[Parameter], spec: mujoco.MjSpec, theta: np.ndarray
     return spec
 
 
-def _freeze(spec: mujoco.MjSpec, nominal: mujoco.MjModel) -> None:
+def frozen(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Return a copy in which what the compiler derives from masses and poses is written out: it keeps these numbers."""
+    spec = spec.copy()
+    nominal = spec.compile()
     for actuator in spec.actuators:
         if actuator.biasprm[2] > 0 and actuator.gainprm[0] == -actuator.biasprm[1]:
             actuator.biasprm[2] = nominal.actuator_biasprm[actuator.id, 2]
     for tendon in spec.tendons:
         if tendon.springlength[0] == tendon.springlength[1] == -1:
             tendon.springlength = nominal.tendon_lengthspring[tendon.id]
+    _freeze_masses(spec, nominal)
+    return spec
+
+
+def _freeze_masses(spec: mujoco.MjSpec, nominal: mujoco.MjModel) -> None:
+    """Where the compiler rescales or bounds masses: state them as it leaves them, and take its rules out."""
+    compiler = spec.compiler
+    if not (compiler.settotalmass > 0 or compiler.balanceinertia or compiler.boundmass or compiler.boundinertia):
+        return
+    for body in spec.bodies[1:]:
+        if nominal.body_mass[body.id]:
+            state(body, nominal)
+    compiler.settotalmass, compiler.balanceinertia, compiler.boundmass, compiler.boundinertia = -1.0, False, 0.0, 0.0
+    compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
 
 
 def _by_id(elements: Iterable[Any], i: int) -> Any:
@@ -127,6 +139,11 @@ def explicit(spec: mujoco.MjSpec, body: Any) -> None:
         for other in spec.bodies:
             if len(other.geoms):
                 other.explicitinertial, other.ipos = False, [np.nan, 0, 0]
+    state(body, model)
+
+
+def state(body: Any, model: mujoco.MjModel) -> None:
+    """Give the body the inertial that it has in the compiled model."""
     body.explicitinertial = True
     body.mass, body.inertia = float(model.body_mass[body.id]), model.body_inertia[body.id]
     body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]

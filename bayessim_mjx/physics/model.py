@@ -13,12 +13,14 @@ from bayessim_mjx.compat import mjx
 from bayessim_mjx.effects.effect import Block, Effect, Measurement, Quantity, layout, overrides
 from bayessim_mjx.effects.support import contract
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.keys import branch
 from bayessim_mjx.parameters import ParameterSpace, constants
 from bayessim_mjx.physics.gates import chained_in
 from bayessim_mjx.physics.native import absent, own_forces
 from bayessim_mjx.physics.warp import Warp
 
 EULER, RK4, IMPLICITFAST = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{n}")) for n in ("EULER", "RK4", "IMPLICITFAST"))
+BRANCHES = 1000  # branches of a reset's key below are the tasks', those from it on the effects'; nothing else uses them
 PARTS = 4  # of a timestep by RK4, in which commands may differ behind effects
 
 
@@ -131,21 +133,34 @@ class Physics:
         each = [moved[:, own].any(1) if moved[:, own].size else np.ones(len(moved), bool) for own in self._slices]
         return np.stack(each, 1) if each else moved[:, :0]
 
-    def world(self, theta: jax.Array, qpos: jax.Array | None = None, qvel: jax.Array | None = None) -> World:
+    def world(
+        self,
+        theta: jax.Array,
+        qpos: jax.Array | None = None,
+        qvel: jax.Array | None = None,
+        key: jax.Array | None = None,
+    ) -> World:
         """Begin a world at the start of an episode, as the sensors show it at rest; writes `theta` into the model once.
 
         Args:
             theta: `[d]`, values of `self.space`.
             qpos: `[nq]`, default the model's qpos0.
             qvel: `[nv]`, default zero.
+            key: of what effects draw in the episode (`Effect.random`); None: always the same.
 
         Raises:
             ValueError: on a wrong shape.
         """
         with jax.default_matmul_precision("highest"):
             world = self.unseen(theta, qpos, qvel)
-            memory, shown = self.sense(self.split(world.theta)[1], world.memory, world.measurement)
+            started = world.memory if key is None else self._seeded(world.memory, key)
+            memory, shown = self.sense(self.split(world.theta)[1], started, world.measurement)
             return world.replace(memory=memory, measurement=shown)
+
+    def _seeded(self, memory: tuple, key: jax.Array) -> tuple:
+        """Return the effects' memories with keys of their own for those that draw at random."""
+        each = enumerate(zip(self.effects, memory, strict=True))
+        return tuple(own | {"key": branch(key, BRANCHES + i)} if effect.random else own for i, (effect, own) in each)
 
     def unseen(
         self,

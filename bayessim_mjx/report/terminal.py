@@ -17,7 +17,7 @@ from bayessim_mjx.report.words import MISSING, between, closure, estimate, not_f
 BEST = 8  # candidates; no source: a matter of style
 NOT_FITTED = 6  # named for each reason; diagnosis.json has all; no source: a matter of style
 Table = tuple[list[str], list[list[str]], tuple[int, ...]]  # header, rows, columns of words
-FILES = ("report.html", "diagnosis.json", "effects.yaml", "model_with_effects.xml")
+FILES = ("report.html", "diagnosis.json", "effects.yaml", "model_with_effects.xml", "model_with_effects.urdf")
 
 
 def console(

@@ -10,6 +10,7 @@ import pytest
 
 from bayessim_mjx import blind_check
 from bayessim_mjx.blind import show, worker
+from bayessim_mjx.blind.check import Check, loader
 from tests.blind.recorded import pendulum
 
 ENTRY = Path(__file__).with_name("entry.py")
@@ -34,6 +35,7 @@ def call(*words: object) -> int:
         (("--model", "m.xml", "--accuracy", "5"), "allowed: per cent"),
         (("--model", "m.xml", "--minutes", "-1"), "allowed: minutes"),
         (("--model", "m.xml", "--cases", "0"), "must be from 1"),
+        (("--task", "Pendulum", "--drive", "torque"), "--drive and --packages are for --model FILE"),
     ],
 )
 def test_what_is_wrong_is_told_in_one_line(words, said, tmp_path, monkeypatch, capsys):
@@ -41,6 +43,26 @@ def test_what_is_wrong_is_told_in_one_line(words, said, tmp_path, monkeypatch, c
     # --headless first: --more takes the rest
     assert blind_check.main(["--headless", *words]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_urdf_has_the_drive_that_the_diagnosis_of_its_cases_gets(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shape = '<collision><geometry><mesh filename="package://mine/a.obj"/></geometry></collision>'
+    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    Path("r.urdf").write_text(
+        f'<robot name="r"><link name="base"/><link name="arm">{inertial}{shape}</link><joint name="elbow" '
+        'type="revolute"><parent link="base"/><child link="arm"/><limit lower="-1" upper="1" effort="5"/></joint>'
+        "</robot>"
+    )
+    Path("meshes").mkdir()
+    Path("meshes/a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    Path("drives.yaml").write_text("elbow: position:40\n")
+    check = Check("out", "r.urdf", drive="drives.yaml", packages=("mine=meshes",))
+    model = loader(check)().compile()
+    assert (model.actuator(0).name, model.actuator_gainprm[0, 0], model.nmesh) == ("elbow", 40, 1)
+    words = worker.command(check, tmp_path / "logs", tmp_path / "out")
+    assert words[words.index("--drive") + 1] == str(tmp_path / "drives.yaml")  # it runs in another folder
+    assert words[words.index("--packages") + 1] == f"mine={tmp_path}/meshes"
 
 
 def test_only_the_three_words_of_a_command_are_replaced(tmp_path):

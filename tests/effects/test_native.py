@@ -69,12 +69,13 @@ def test_what_cannot_be_written_is_said_with_the_reason_and_leaves_no_trace(spec
     assert model.dof_frictionloss[0] == pytest.approx(0.3)
 
 
-def test_masses_that_mujoco_fixes_by_their_sum_are_said_too(spec):
-    spec.compiler.settotalmass = 3.0
+def test_masses_that_mujoco_fixes_by_their_sum_are_those_that_it_found(spec):
+    spec.compiler.settotalmass = 6.0  # twice what the geoms have
     space = ParameterSpace([Parameter("mass", 1.0, 0.5, 2.0, attribute="mass", target="a", kind="body")])
-    written, missing = write_model(spec, space, [1.1])
-    assert len(missing) == 1 and missing[0].startswith("calibrated parameters: compiler settotalmass=3")
-    assert written.compile().body_mass[1:] == pytest.approx([1.0, 2.0])
+    load = effects.make("payload", where="body2")
+    written, missing = write_model(spec, space, [1.1], [load], {"body2.payload.mass": 0.5})
+    model = mujoco.MjModel.from_xml_string(written.to_xml())
+    assert missing == [] and model.body_mass[1:] == pytest.approx([2.2, 4.5])
 
 
 def test_an_unknown_place_is_refused(spec):

@@ -184,10 +184,12 @@ def test_refusals_when_writing_and_editing():
     ):
         with pytest.raises(UserError, match=words):
             ParameterSpace([p]).write(model, jnp.ones(1))
-    totals = spec_of(PENDULUM)
-    totals.compiler.settotalmass = 3
-    with pytest.raises(UserError, match="settotalmass=3"):
-        space.edit(totals, space.nominal)
+
+
+def test_masses_that_the_compiler_changes_are_scaled_as_it_leaves_them():
+    spec, (_, space) = spec_of(PENDULUM), pendulum()
+    spec.compiler.settotalmass, spec.compiler.boundinertia = 3.0, 0.5
+    assert_write_equals_recompile(spec, space, random_thetas(space, 1))
 
 
 def test_edit_leaves_the_given_spec_alone():

@@ -119,7 +119,7 @@ def kinds_of(effects: str | Sequence[str | type[Effect]]) -> list[type[Effect]]:
     "all", alone or among others: those of the library that are on offer (`offered`).
 
     Raises:
-        UserError: an unknown effect.
+        UserError: an unknown effect, or a random one.
     """
     asked = [effects] if isinstance(effects, str) else effects
     found: list[type[Effect]] = []
@@ -127,6 +127,13 @@ def kinds_of(effects: str | Sequence[str | type[Effect]]) -> list[type[Effect]]:
         kinds = map(library.load, library.names()) if name == "all" else ()
         found += [kind for kind in kinds if kind.offered]
         found += [] if name == "all" else [library.load(name) if isinstance(name, str) else name]
+    random = [kind.name for kind in found if kind.random]
+    if random:  # a fit compares one deterministic motion with the log
+        raise UserError(
+            f"--effects {random[0]}: it is random, and fits are not; `bayessim-mjx logs check` reads it from the "
+            "columns sent:command, received:command, sent:measurement and received:measurement; allowed: "
+            "actuator_delay and sensor_delay, which find the mean"
+        )
     return in_order(dict.fromkeys(found))
 
 

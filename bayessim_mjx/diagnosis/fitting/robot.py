@@ -22,6 +22,7 @@ from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import ParameterSpace, elements
 from bayessim_mjx.physics import Physics
 from bayessim_mjx.physics.native import moved_to_joints
+from bayessim_mjx.physics.visuals import needs_geoms, with_options, without_meshes, without_visuals
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Task
@@ -54,6 +55,8 @@ class Robot:
         accuracy: {parameter: standard deviation as a share}, of what a data sheet states; rating: {body: kg carried}.
         assumed: those of them whose accuracy nobody stated.
         unlimited: joints whose limits its physics leaves out; rounds: most iterations of its solver (`pruned`).
+        urdf: the URDF file that it was read from, if it was.
+        lean: the model that is simulated with the options of `mj_model`, where that one has meshes only to look at.
     """
 
     mj_model: mujoco.MjModel
@@ -67,6 +70,8 @@ class Robot:
     assumed: frozenset[str] = frozenset()
     unlimited: tuple[int, ...] = ()
     rounds: int | None = None
+    urdf: Path | None = None
+    lean: mujoco.MjModel | None = None
 
     def stated(self, accuracy: Sequence[str] = (), payload: Sequence[str] = ()) -> "Robot":
         """With what was said of its data sheet, as `--accuracy` and `--payload` (`data_sheet`)."""
@@ -84,7 +89,8 @@ class Robot:
         self, control_dt: float, effects: Sequence[Effect] = (), space: ParameterSpace | None = None
     ) -> Physics:
         """Return the robot at control steps of `control_dt` s, with `space` in the place of its own parameters."""
-        model = with_timestep(self.mj_model, control_dt)
+        model = self.mj_model if self.lean is None else with_options(self.lean, self.mj_model)
+        model = with_timestep(model, control_dt)
         model.jnt_limited[list(self.unlimited)] = 0
         if self.rounds is not None:
             model.opt.iterations = min(self.rounds, model.opt.iterations)
@@ -115,7 +121,8 @@ def robot_of(source: Source, parameters: str | Path | None = None) -> Robot:
         if parameters is None:
             return source
         space = read_params(parameters, source.mj_model)
-        return dataclasses.replace(source, space=space, accuracy={}, assumed=frozenset())
+        lean = None if needs_geoms(space) else source.lean
+        return dataclasses.replace(source, space=space, accuracy={}, assumed=frozenset(), lean=lean)
     if isinstance(source, mujoco.MjModel):
         name = bytes(source.names).split(b"\0")[0].decode() or "model"
         check(source, name)
@@ -151,12 +158,20 @@ def of_file(
         UserError: the file is missing, MuJoCo cannot load it, it has nothing to diagnose, or MJX lacks a feature.
     """
     path = Path(path)
-    if not path.is_file():
-        raise UserError(f"--model {path}: no such file")
-    spec = _by_mujoco("load", str(path), lambda: urdf.read(path, packages))
-    if drive is not None:
-        urdf.drive(spec, drive)
-    return _of_spec(spec, str(path), path.stem, parameters)
+    robot = _of_spec(urdf.load(path, drive, packages), str(path), path.stem, parameters)
+    return dataclasses.replace(robot, urdf=path) if urdf.is_urdf(path) else robot
+
+
+def names_of(path: str | Path, drive: str | None = None, packages: Sequence[str] = ()) -> mujoco.MjModel:
+    """Return a model of a file that has its joints and actuators, but no meshes and not its masses.
+
+    Raises:
+        UserError: the file is missing, MuJoCo cannot load it, or it has no joint or actuator.
+    """
+    spec = urdf.load(Path(path), drive, packages)
+    model = _by_mujoco("compile", str(path), lambda: without_meshes(spec))
+    urdf.check_names(model, str(path))
+    return model
 
 
 def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path | None) -> Robot:
@@ -166,8 +181,11 @@ def _of_spec(spec: mujoco.MjSpec, source: str, name: str, parameters: str | Path
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     moved_to_joints(spec)
     model = whole_inertia(spec, _by_mujoco("compile", source, spec.compile))
-    check(model, source)
-    return Robot(model, spec.copy, None, _space(model, parameters), name)._from_data_sheet(parameters is None)
+    lean = _by_mujoco("compile", source, lambda: without_visuals(spec, model))
+    check(model, source, lean)
+    space = _space(model, parameters)
+    shown = lean is model or needs_geoms(space)
+    return Robot(model, spec.copy, None, space, name, lean=None if shown else lean)._from_data_sheet(parameters is None)
 
 
 def _by_mujoco(does: str, source: str, call: Callable[[], Any]) -> Any:

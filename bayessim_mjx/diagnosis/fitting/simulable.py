@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from bayessim_mjx import urdf
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import Physics, mjx
@@ -23,15 +24,9 @@ def one_line(error: Exception) -> str:
     return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
-def check(model: mujoco.MjModel, source: str) -> None:
-    """Refuse a model without motion or commands, and what MJX cannot simulate."""
-    if not model.njnt:
-        raise UserError(f"{source}: the model has no joint, so there is no motion to compare")
-    if not model.nu:
-        raise UserError(
-            f"{source}: the model has no actuator, so the logged commands cannot act on it; allowed: --drive torque "
-            "(the logs have efforts), --drive position:KP,KV (they have targets), or --drive FILE.yaml by joint"
-        )
+def check(model: mujoco.MjModel, source: str, lean: mujoco.MjModel | None = None) -> None:
+    """Refuse a model without motion or commands, and what MJX cannot simulate; lean: what it is simulated as."""
+    urdf.check_names(model, source)
     step = float(model.opt.timestep)
     if not (math.isfinite(step) and step > 0):
         raise UserError(f"{source}: <option timestep> = {step:g}; allowed: seconds > 0")
@@ -47,7 +42,7 @@ def check(model: mujoco.MjModel, source: str) -> None:
     if why := absent(model):
         raise UserError(f"{source}: MJX does not simulate {why}")
     try:
-        mjx.make_data(mjx.put_model(model, impl="jax"))
+        mjx.make_data(mjx.put_model(model if lean is None else lean, impl="jax"))
     except (NotImplementedError, ValueError, TypeError) as error:
         raise UserError(f"{source}: MJX cannot simulate this model: {one_line(error)}{_remedy(str(error))}") from None
 

@@ -229,7 +229,8 @@ def at_bound(bound: Bound, unit: str) -> str:
 
 def not_on_offer(tried: Iterable[str]) -> str:
     """Effects that are tried only if they are named, in words; "" if all were. tried: names of effects."""
-    names = [name for name in library.names() if not library.load(name).offered and name not in set(tried)]
+    kinds = ((name, library.load(name)) for name in library.names())
+    names = [name for name, kind in kinds if not (kind.offered or kind.random) and name not in set(tried)]
     nouns = listed([words(name).noun for name in names])
     return f"Not tried because not named: {nouns} (--effects all,{','.join(names)})." if names else ""
 

@@ -13,7 +13,6 @@ import yaml
 from numpy.typing import NDArray
 
 from bayessim_mjx import atomic
-from bayessim_mjx.diagnosis import correction
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting import journal
@@ -25,6 +24,7 @@ from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.diagnosis.statistics import of_one
 from bayessim_mjx.diagnosis.summary import assemble
+from bayessim_mjx.diagnosis.summary.written import write_outputs
 from bayessim_mjx.errors import UserError
 
 PRELIMINARY = "preliminary.json"  # results while the search goes on
@@ -94,7 +94,7 @@ class Files(Observer):
         result.save(self.folder)  # before anything that could fail: nothing computed is lost
         result = load(self.folder)
         if result.verdict != "insufficient_data":
-            left_out = correction.write_outputs(result, robot, self.folder)
+            left_out = write_outputs(result, robot, self.folder)
             result = replace(result, warnings=[*result.warnings, *left_out])
             result.save(self.folder)
         return result

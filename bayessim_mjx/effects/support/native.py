@@ -12,6 +12,7 @@ from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.support.bodies import whole_inertia
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.parameters.editing import frozen
 
 Values = dict[str, dict[str, float]]  # [place][quantity]
 
@@ -35,10 +36,11 @@ def write_model(
         (spec, one sentence for each thing that is not expressed in it, with the reason).
     """
     missing: list[str] = []
+    spec = frozen(spec)
     try:
         spec = space.edit(spec, theta)
     except UserError as error:
-        spec, missing = spec.copy(), [f"calibrated parameters: {error}"]
+        missing = [f"calibrated parameters: {error}"]
     for effect in effects:
         spec, why = _add(spec, effect, _values(effect, values or {}))
         missing += [f"{effect.name} at {', '.join(effect.places())}: {why}"] if why else []

@@ -1,0 +1,84 @@
+"""Measurements in messages that arrive after varying times, or are lost: shared buses, radio, bursts of a driver."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
+from bayessim_mjx.effects.support import packets
+from bayessim_mjx.effects.support.motion import between
+from bayessim_mjx.effects.support.site import Site, columns, written
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorPackets(Effect):
+    """measured(t) = q(t - a): the age a is the delay drawn at t, but nothing older is shown than what was shown before.
+
+    Between control steps the acceleration is taken as constant, as by `sensor_delay`. One message serves all joints
+    where these are tied ("all"); else each has its own.
+
+    Parameters: `delay`, mean of the delay, s, neutral 0; `jitter`, its standard deviation, s, neutral 0; `loss`, share
+    of the measurements that never arrive, neutral 0.
+
+    Attributes:
+        law: of the delay: gamma, uniform or two_point (mean +- jitter, one as often as the other).
+        lost: hold: the last measurement stays; zero: positions and velocities read 0.
+    """
+
+    where: str | tuple[str, ...] = "all"
+    law: str = "gamma"
+    lost: str = "hold"
+    name: ClassVar[str] = "sensor_packets"
+    kind: ClassVar[str] = "joint"
+    late: ClassVar[bool] = True
+    random: ClassVar[bool] = True
+    offered: ClassVar[bool] = False
+    noun: ClassVar[str] = "varying measurement delay and loss"
+    lacks: ClassVar[str] = "a varying measurement delay and lost measurements"
+    separates: ClassVar[str] = "times at which each measurement was sent and received (`sent:measurement` ...)"
+    quantities: ClassVar[tuple[Quantity, ...]] = packets.quantities(0.02)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        packets.check(self.name, self.law, self.lost)
+
+    def init(self, at: Site) -> Any:
+        """Return the measurements `[lag, n, 2]` after past control steps, newest last, and the age of the shown one."""
+        lag = max(2, packets.slots(self, at))
+        return {
+            "key": jnp.zeros(2, jnp.uint32),
+            "history": jnp.zeros((lag, len(at), 2)),
+            "age": jnp.full(1 if at.tied else len(at), jnp.float32(lag)),
+            "fresh": jnp.ones((), bool),
+        }
+
+    def on_measurement(
+        self, at: Site, memory: Any, measurement: Measurement, theta: jax.Array
+    ) -> tuple[Any, Measurement]:
+        now, values, lag = columns(at, **measurement), at.values(theta), memory["history"].shape[0]
+        key, draw = jax.random.split(memory["key"])
+        delay, gone = packets.draw(draw, packets.receivers(at, values), self.law)
+        past = jnp.where(memory["fresh"], now, memory["history"])
+        signal = jnp.concatenate([past, now[None]])  # row `lag` is now
+        age = jnp.minimum(delay / jnp.float32(at.dt), memory["age"] + 1.0)
+        age = jnp.clip(jnp.where(gone, memory["age"] + 1.0, age), 0.0, lag)
+        steps = jnp.broadcast_to(age, (len(at),))
+        whole = jnp.minimum(jnp.floor(steps), lag - 1.0)
+        row, joint = lag - whole.astype(jnp.int32), jnp.arange(len(at))
+        newer, older = signal[row, joint], signal[row - 1, joint]
+        part, gained = steps - whole, older[:, 1] - newer[:, 1]
+        position = between(newer[:, 0], older[:, 0], -gained, part, at.dt)
+        shown = jnp.stack([position, newer[:, 1] + part * gained], axis=-1)
+        if self.lost == "zero":
+            shown = jnp.where(gone[:, None], 0.0, shown)
+        shown = jnp.where(jnp.any(values != 0, axis=1, keepdims=True), shown, now)
+        memory = {"key": key, "history": signal[1:], "age": age, "fresh": jnp.zeros((), bool)}
+        return memory, written(at, **measurement, values=shown)
+
+    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
+        return "MuJoCo has no messages with random delays; use effects.yaml"
