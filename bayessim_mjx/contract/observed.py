@@ -17,6 +17,7 @@ from bayessim_mjx.contract.state import FRAMES, VECTORS
 
 Array = NDArray[np.float64]
 MOST = 0.8  # of the entries have to follow a rule that is meant for all; a rule of thumb
+SLOPE = 1.5  # factor between a measured velocity and the slope of the position over two steps; a rule of thumb
 OTHER = 0.1  # share of variance that another source may leave to be named; a rule of thumb
 
 
@@ -65,7 +66,8 @@ def _group(evidence: Evidence, result: Result, entries: list[Entry], seen: Array
         seen = axes.continuous(seen, [len(run.time) for run in evidence.runs])
     reference = evidence.reference(entries)
     delays = [d for d in DELAYS if d >= 0] if kind == "action" else DELAYS
-    if kind == "task":
+    slopes = kind == "qvel" and not any(e.source in run.channels for run in evidence.runs for e in entries)
+    if kind == "task" or slopes:
         delays = [0]
     # a log may be written before the clip or after it
     limited = np.where(np.abs(np.abs(seen) - clip) > 1e-6, seen, np.nan) if np.isfinite(clip) else seen
@@ -86,6 +88,7 @@ def _group(evidence: Evidence, result: Result, entries: list[Entry], seen: Array
         and _commands_back(evidence, seen, entries)
     ):
         found = [Finding("observation", "command_fed_back", tuple(e.name for e in entries))]
+    found = [f for f in found if not (slopes and _small(f))]
     found += _others(evidence, entries, limited, relation, result)
     left = float(np.mean(relation.left))
     result.findings += [replace(f, left=left, before=before) for f in axes.merged(entries, seen, found, relation)]
@@ -93,6 +96,13 @@ def _group(evidence: Evidence, result: Result, entries: list[Entry], seen: Array
     right = [e.name for e, told in zip(entries, relation.told, strict=True) if told and e.name not in bad]
     result.compared.setdefault("observation", []).extend(right)
     return relation
+
+
+def _small(finding: Finding) -> bool:
+    """Whether a finding is no larger than the slope of a position differs from a measured velocity."""
+    if finding.kind == "scale" and isinstance(finding.found, float) and isinstance(finding.expected, float):
+        return 1 / SLOPE < finding.found / finding.expected < SLOPE
+    return finding.kind in ("offset", "unrelated")
 
 
 def _fed_back(evidence, entries, seen, relation, delays, reference):  # type: ignore[no-untyped-def]
