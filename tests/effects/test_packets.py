@@ -160,9 +160,9 @@ def test_a_task_randomises_them_and_off_they_change_no_bit():
         "command_packets": {"all": {"delay": {"range": [0, 0.01]}, "loss": {"range": [0, 0.2]}}},
         "sensor_packets": {"all": {"jitter": {"range": [0, 0.01]}, "loss": {"range": [0, 0.2]}}},
     }
+    task = type(registry.make("Pendulum"))
     env, bare = (
-        registry.make("Pendulum", randomization={"randomization_params": section})
-        for section in ({"effects": settings}, {"effects": {}})
+        task(randomization={"randomization_params": section}) for section in ({"effects": settings}, {"effects": {}})
     )
     names = [f"all.{e}.{q}" for e in settings for q in ("delay", "jitter", "loss")]
     assert list(env.space.names) == names
@@ -195,3 +195,10 @@ def test_wrong_settings_are_refused():
     (far,) = listed([{"effect": "command_packets", "where": "all", "parameters": {"jitter": {"range": [0, 10]}}}])
     with pytest.raises(UserError, match="are 6003 control steps of 0.01 s; allowed: 256"):
         far.init(far.bind(MODEL, H, S))
+
+
+def test_held_losses_are_late_by_their_odds_in_periods():
+    """A command that counts up: the age of the one that is held is geometric, of mean p / (1 - p)."""
+    command = np.arange(4000, dtype=np.float32)[:, None] * np.ones(2, np.float32)
+    out = obeyed(effects.make("command_packets", where="all"), [0, 0, 0.2], command)
+    assert np.mean(command[:, 0] - out[:, 0, 0]) == pytest.approx(0.25, abs=0.04)
