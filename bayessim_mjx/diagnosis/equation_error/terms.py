@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -115,7 +116,7 @@ def _on_actuators(
     dof = {i: v for i, v in driven if source[v] == "ctrl"}
     for name, i in layout.gains:
         if i in dof:
-            own = library.load(name)
+            own: Any = library.load(name)
             known = own.modelled(model, [i]) if issubclass(own, OfGains) else own.declared(law, [i])
             out.append(_gain(name, title[i], layout, layout.gain(name, i), dof[i], known))
     if len(driven) > 1:

@@ -97,7 +97,7 @@ def loops_of(model: mujoco.MjModel, logs: Sequence[Log]) -> dict[str, np.ndarray
     law = controllers.of_logs(logs, model)
     if law is None:
         return dict.fromkeys(("kp", "kd"), np.zeros(model.nu, bool))
-    return {gain: (np.asarray(getattr(law, gain)) > 0).any(0) for gain in ("kp", "kd")}
+    return {gain: np.any(np.asarray(getattr(law, gain)) > 0, axis=0) for gain in ("kp", "kd")}
 
 
 def measured(log: Log, actuator: int) -> Array | None:

@@ -146,11 +146,11 @@ def wrong(effect: FoundEffect) -> str:
     ((_, value),) = (quantity(k, v) for k, v in effect.parameters.items())
     neutral = kind.quantities[0].neutral
     if kind.relative:
-        ((what, model),) = effect.modelled.items() or [("", math.nan)]
-        own = effect.parameters.get(what)
-        if own is None or own.bound:
+        (factor,) = effect.parameters.values()
+        model = next(iter(effect.modelled.values()), math.nan)
+        if factor.bound or not finite(model):
             return f"the {name} is {value} times the model's"
-        return f"the {name} is {measured(model * own.mean, model * own.sd)}, not {model:g}"
+        return f"the {name} is {measured(model * factor.mean, model * factor.sd)}, not {model:g}"
     return f"the {name} is {value}, not {neutral:g}" if neutral else f"the {name} is off by {value}"
 
 
