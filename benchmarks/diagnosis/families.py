@@ -16,6 +16,9 @@ FAMILIES = (
     ("actuator_gain", "sensor_gain", "armature", "payload", "actuator_saturation", "effort_loss", "speed_torque_limit",
      "gain_drift", "inertial_parameters", "effort_coupling"),
     ("contact_friction", "contact_compliance", "ground_height"),
+    ("controller_stiffness", "controller_damping", "actuator_gain", "viscous_friction", "joint_spring"),
+    ("body_drag", "directional_drag", "wind"),
+    ("command_packets", "sensor_packets"),
 )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis import data_sheet, statistics
 from bayessim_mjx.diagnosis.correction import UNIFORM
 from bayessim_mjx.diagnosis.evidence.parameters import Posterior
@@ -153,14 +154,15 @@ def _effect(found: Findings, effect: Candidate, sd: Array, part: dict[str, Any])
 
 def _modelled(setup: Setup, effect: Candidate) -> dict[str, float]:
     """Return the numbers of model or logs that an effect's parameters multiply, where all places have the same."""
+    own = library.known(effect.effect)
+    if own is None or not issubclass(own, OfGains | OfLoops):
+        return {}
     physics = setup.physics
-    for kind, site in zip(physics.effects, physics.sites, strict=True):
-        here = [i for name, i in zip(site.names, site.ids, strict=True) if effect.where in (name, "all")]
-        if kind.name == effect.effect and isinstance(kind, OfGains):
-            return kind.modelled(physics.mj_model, here)
-        if kind.name == effect.effect and isinstance(kind, OfLoops):
-            return kind.declared(setup.fitter.simulator.windows.batch.law, here)
-    return {}
+    site = next(s for e, s in zip(physics.effects, physics.sites, strict=True) if e.name == effect.effect)
+    here = [i for name, i in zip(site.names, site.ids, strict=True) if effect.where in (name, "all")]
+    if issubclass(own, OfGains):
+        return own.modelled(physics.mj_model, here)
+    return own.declared(setup.fitter.simulator.windows.batch.law, here)
 
 
 def _shared(effect: Candidate, own: Size, rivals: list[Rival], weights: list[float]) -> dict[str, Any]:

@@ -85,11 +85,11 @@ def test_a_servo_has_no_effort_to_compare() -> None:
 
 
 def test_what_was_not_compared_is_said_once_for_all_logs(arm: Log) -> None:
-    still = [dataclasses.replace(arm.cut(0, 60), name=f"run{i}") for i in range(5)]
+    still = [dataclasses.replace(arm.cut(0, 60), name=f"run{i}") for i in range(8)]
     gate = check(still, model(ARM), DT)
     told = [w for w in gate.warnings if "not compared" in w]
     assert len(told) == 1, gate.warnings
-    assert "run0, run1, run2 and 2 more" in told[0] and all(joint in told[0] for joint in arm.joints)
+    assert "run0, run1, run2, run3, run4, run5 and 2 more" in told[0] and all(joint in told[0] for joint in arm.joints)
 
 
 def test_a_pendulum_that_only_falls_is_not_refused() -> None:
