@@ -52,24 +52,25 @@ def _parser() -> cli.PlainParser:
     return parser
 
 
-def _check(formats: Any, prog: str) -> None:
-    text = "how logs are read, and the channels that are missing"
-    parser = formats.add_parser("check", help=text, description=f"Show {text}; write a map.yaml where there is none.")
-    parser.usage = f"{prog} check DIR [--model FILE] [--map FILE]"
+def _of_folder(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", metavar="DIR", help="folder of logs, or one file")
     parser.add_argument("--model", metavar="FILE", help="MJCF or URDF model; it names joints and actuators")
     cli.of_urdf(parser)
     parser.add_argument("--map", metavar="FILE", help="map of the columns (default: map.yaml in the folder)")
+
+
+def _check(formats: Any, prog: str) -> None:
+    text = "how logs are read, and the channels that are missing"
+    parser = formats.add_parser("check", help=text, description=f"Show {text}; write a map.yaml where there is none.")
+    parser.usage = f"{prog} check DIR [--model FILE] [--map FILE]"
+    _of_folder(parser)
 
 
 def _show(formats: Any, prog: str) -> None:
     text = "a page of logs: channels, spectra, coverage, what excites what, rates"
     parser = formats.add_parser("show", help=text, description=f"Write {text}.")
     parser.usage = f"{prog} show DIR [--model FILE] [--map FILE] [--out FILE] [--mcap FILE]"
-    parser.add_argument("path", metavar="DIR", help="folder of logs, or one file")
-    parser.add_argument("--model", metavar="FILE", help="MJCF or URDF model; it names joints and actuators")
-    cli.of_urdf(parser)
-    parser.add_argument("--map", metavar="FILE", help="map of the columns (default: map.yaml in the folder)")
+    _of_folder(parser)
     parser.add_argument("--out", metavar="FILE", default="show.html", help="the page (default: show.html)")
     parser.add_argument("--mcap", metavar="FILE", help="write the logs as MCAP, too, for Foxglove (extra [logs])")
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
-from bayessim_mjx.effects.support.motion import Motion, between
+from bayessim_mjx.effects.support.motion import Motion, delayed
 from bayessim_mjx.effects.support.quantity import delay
 from bayessim_mjx.effects.support.site import Site, columns, written
 
@@ -63,15 +63,9 @@ class SensorDelay(Effect):
     ) -> tuple[Any, Measurement]:
         now, lag = columns(at, **measurement), memory["history"].shape[0]
         past = jnp.where(memory["fresh"], now, memory["history"])
-        signal = jnp.concatenate([past, now[None]])  # row `lag` is now
         steps = jnp.clip(at.values(theta)[:, 0] / jnp.float32(at.dt), 0.0, lag)
-        whole = jnp.minimum(jnp.floor(steps), lag - 1.0)
-        row, joint = lag - whole.astype(jnp.int32), jnp.arange(len(at))
-        newer, older = signal[row, joint], signal[row - 1, joint]
-        part, gained = steps - whole, older[:, 1] - newer[:, 1]
-        position = between(newer[:, 0], older[:, 0], -gained, part, at.dt)
-        shown = jnp.stack([position, newer[:, 1] + part * gained], axis=-1)
-        memory = {"history": signal[1:], "fresh": jnp.zeros((), bool)}
+        shown, history = delayed(past, now, steps, at.dt)
+        memory = {"history": history, "fresh": jnp.zeros((), bool)}
         return memory, written(at, **measurement, values=shown)
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:

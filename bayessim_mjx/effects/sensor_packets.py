@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
 from bayessim_mjx.effects.support import packets
-from bayessim_mjx.effects.support.motion import between
+from bayessim_mjx.effects.support.motion import delayed
 from bayessim_mjx.effects.support.site import Site, columns, written
 
 if TYPE_CHECKING:
@@ -64,20 +64,13 @@ class SensorPackets(Effect):
         key, draw = jax.random.split(memory["key"])
         delay, gone = packets.draw(draw, packets.receivers(at, values), self.law)
         past = jnp.where(memory["fresh"], now, memory["history"])
-        signal = jnp.concatenate([past, now[None]])  # row `lag` is now
         age = jnp.minimum(delay / jnp.float32(at.dt), memory["age"] + 1.0)
         age = jnp.clip(jnp.where(gone, memory["age"] + 1.0, age), 0.0, lag)
-        steps = jnp.broadcast_to(age, (len(at),))
-        whole = jnp.minimum(jnp.floor(steps), lag - 1.0)
-        row, joint = lag - whole.astype(jnp.int32), jnp.arange(len(at))
-        newer, older = signal[row, joint], signal[row - 1, joint]
-        part, gained = steps - whole, older[:, 1] - newer[:, 1]
-        position = between(newer[:, 0], older[:, 0], -gained, part, at.dt)
-        shown = jnp.stack([position, newer[:, 1] + part * gained], axis=-1)
+        shown, history = delayed(past, now, jnp.broadcast_to(age, (len(at),)), at.dt)
         if self.lost == "zero":
             shown = jnp.where(gone[:, None], 0.0, shown)
         shown = jnp.where(jnp.any(values != 0, axis=1, keepdims=True), shown, now)
-        memory = {"key": key, "history": signal[1:], "age": age, "fresh": jnp.zeros((), bool)}
+        memory = {"key": key, "history": history, "age": age, "fresh": jnp.zeros((), bool)}
         return memory, written(at, **measurement, values=shown)
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:

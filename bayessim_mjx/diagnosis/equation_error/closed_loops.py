@@ -6,7 +6,7 @@ sampled as the log is, shows the same ones: by as much as that is a gain wrong w
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -49,21 +49,16 @@ def of_loop(term: Term) -> bool:
 
 def of_model(log: Log, model: mujoco.MjModel) -> Log:
     """Return the log that the model makes of the same commands, without noise, from the same start."""
-    data, law, read = mujoco.MjData(model), None, controllers.declared(log.metadata)
-    if read:
-        law = drives.DeclaredLaw(controllers.read(log.metadata, model, log.actuators, log.name))
+    data = mujoco.MjData(model)
+    law = drives.DeclaredLaw(controllers.read(log.metadata, model, log.actuators, log.name))
     data.qpos[:], data.qvel[:] = log.qpos[0], log.qvel[0]
     step, rows = float(model.opt.timestep), []
     for k, time in enumerate(log.time):
         while k and data.time < time - log.time[0] - step / 2:
-            command = log.ctrl[k - 1]
-            data.ctrl[:] = command if law is None else law(command, data.qpos, data.qvel)
+            data.ctrl[:] = law(log.ctrl[k - 1], data.qpos, data.qvel)
             mujoco.mj_step(model, data)
         rows.append(np.concatenate([data.qpos, data.qvel]))
     qpos, qvel = np.split(np.nan_to_num(np.array(rows)), [model.nq], axis=1)
-    return replace(log, qpos=qpos, qvel=qvel, streams=_without_drives(log.streams))
-
-
-def _without_drives(streams: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Leave out efforts: where one was measured, the motion of the model did not make it."""
-    return {name: own for name, own in streams.items() if not name.startswith("effort:")}
+    # a measured effort did not make this motion
+    streams = {name: own for name, own in log.streams.items() if not name.startswith("effort:")}
+    return replace(log, qpos=qpos, qvel=qvel, streams=streams)

@@ -180,13 +180,12 @@ def _by_gain(log: Log, model: mujoco.MjModel, kind: type[Effect], actuator: int,
 
     Without a force limit all are the same.
     """
-    log = drives.centred(log)
+    log, law = drives.centred(log), controllers.read(log.metadata, model, log.actuators, log.name)
     for factor in GAINS:
         factor = factor if factor != 1.0 else 1.0 + SHIFT
         if issubclass(kind, OfGains):
             moved = drives.commanded(log, kind.scaled(model, actuator, factor))
         else:
-            law = controllers.read(log.metadata, model, log.actuators, log.name)
             gains = getattr(law, kind.loop).at[actuator].multiply(factor)
             moved = drives.commanded(log, model, law.replace(**{kind.loop: gains}))
         yield (moved[:, actuator] - force) / (factor - 1.0)

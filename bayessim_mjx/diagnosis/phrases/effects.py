@@ -76,6 +76,11 @@ def measured(mean: Any, sd: Any = None, unit: str = "") -> str:
     return f"{text} {unit}".rstrip()
 
 
+def multiplied(model: float, mean: float, sd: float | None) -> str:
+    """`7.27 +- 0.06, not 20`, of a multiple of a number that the model or the logs have."""
+    return f"{measured(model * mean, None if sd is None else model * sd)}, not {model:g}"
+
+
 def spanned(mean: float, low: float, high: float, unit: str) -> str:
     """`4.76 ms (90 %: 4.21 to 5.30)`, rounded by the width of the interval."""
     if unit == "s" and abs(mean) < 1:
@@ -150,7 +155,7 @@ def wrong(effect: FoundEffect) -> str:
         model = next(iter(effect.modelled.values()), math.nan)
         if factor.bound or not finite(model):
             return f"the {name} is {value} times the model's"
-        return f"the {name} is {measured(model * factor.mean, model * factor.sd)}, not {model:g}"
+        return f"the {name} is {multiplied(model, factor.mean, factor.sd)}"
     return f"the {name} is {value}, not {neutral:g}" if neutral else f"the {name} is off by {value}"
 
 

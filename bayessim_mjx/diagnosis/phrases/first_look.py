@@ -9,7 +9,7 @@ from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.equation_error.search import Proposal
 from bayessim_mjx.diagnosis.logcheck.drives import LEAST
 from bayessim_mjx.diagnosis.logcheck.links import Channel
-from bayessim_mjx.diagnosis.phrases.effects import any_of, measured, titled
+from bayessim_mjx.diagnosis.phrases.effects import any_of, measured, multiplied, titled
 from bayessim_mjx.quantities import MOST, listed, percent
 
 
@@ -98,14 +98,10 @@ def _mechanism(look: Look) -> str:
 
 
 def _proposal(p: Proposal) -> str:
-    each = ((k, v, p.deviations[k]) for k, v in p.parameters.items() if v)
-    numbers = ", ".join(_number(p.term.modelled.get(k), k, v, sd if sd < 1e6 else None) for k, v, sd in each)
+    each = [(k, v, sd if (sd := p.deviations[k]) < 1e6 else None) for k, v in p.parameters.items() if v]
+    own = p.term.modelled
+    numbers = ", ".join(
+        multiplied(own[k], v, sd) if k in own else f"{k.replace('_', ' ')} {measured(v, sd)}" for k, v, sd in each
+    )
     rivals = any_of(p.rivals, MOST)
     return f"first guess: {titled(p.term.effect, p.term.where)}: {numbers}{f'; or {rivals}' if rivals else ''}"
-
-
-def _number(modelled: float | None, name: str, value: float, sd: float | None) -> str:
-    """Return a number with its name; of one that multiplies the model's own, the product."""
-    if modelled is None:
-        return f"{name.replace('_', ' ')} {measured(value, sd)}"
-    return f"{measured(modelled * value, None if sd is None else modelled * sd)}, not {modelled:g}"

@@ -90,15 +90,13 @@ def whole_logs(
     """
     out = []
     if chaotic:
-        which = f"{len(chaotic)} of {len(names)} logs ({listed(chaotic, most=MOST)})"
         used = f"they count up to there, {seconds:.2g} s at most" if kept else "they are not counted"
         out.append(
-            f"unstable or chaotic motion: in {which} the uncertain start alone exceeds the tolerance. "
+            f"unstable or chaotic motion: in {_some(chaotic, names)} the uncertain start alone exceeds the tolerance. "
             f"No simulator can predict them whole: {used}"
         )
     if broken:
-        which = f"{len(broken)} of {len(names)} logs ({listed(broken, most=MOST)})"
-        out.append(f"simulated open loop, {which} diverge: whole logs are compared without them")
+        out.append(f"simulated open loop, {_some(broken, names)} diverge: whole logs are compared without them")
     lost = [f"{STAGES[stage]} in {count} of {kept}" for stage, count in away.items() if count]
     if lost:
         text = "over whole logs the simulator leaves the measured motion"
@@ -107,6 +105,10 @@ def whole_logs(
         text = f"{seen} of {len(names)} whole logs are simulated with parameters fitted to them"
         out.append(f"{text}: these errors are in sample")
     return out
+
+
+def _some(few: Sequence[str], names: Sequence[str]) -> str:
+    return f"{len(few)} of {len(names)} logs ({listed(few, most=MOST)})"
 
 
 def inertial(found: Sequence[Base], stands: Sequence[Stand | None]) -> list[str]:

@@ -58,3 +58,18 @@ def between(one: jax.Array, two: jax.Array, gained: jax.Array, part: jax.Array, 
         dt: s.
     """
     return (1 - part) * one + part * two - 0.5 * jnp.float32(dt) * part * (1 - part) * gained
+
+
+def delayed(past: jax.Array, now: jax.Array, steps: jax.Array, dt: float) -> tuple[jax.Array, jax.Array]:
+    """Positions and velocities `[n, 2]` as they were `steps` `[n]` control steps ago, and the past one step later.
+
+    Args:
+        past: `[lag, n, 2]`, after the control steps before, newest last; now: `[n, 2]`; steps: 0 to lag.
+    """
+    lag, signal = past.shape[0], jnp.concatenate([past, now[None]])  # row `lag` is now
+    whole = jnp.minimum(jnp.floor(steps), lag - 1.0)
+    row, joint = lag - whole.astype(jnp.int32), jnp.arange(len(now))
+    newer, older = signal[row, joint], signal[row - 1, joint]
+    part, gained = steps - whole, older[:, 1] - newer[:, 1]
+    position = between(newer[:, 0], older[:, 0], -gained, part, dt)
+    return jnp.stack([position, newer[:, 1] + part * gained], axis=-1), signal[1:]
