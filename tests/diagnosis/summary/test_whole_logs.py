@@ -54,7 +54,7 @@ def test_each_log_has_draws_of_its_own(rubbing):
     away = []
     for w in (int(np.flatnonzero(cut.log == log)[0]) for log in range(3)):
         thetas, _ = again._drawn(rubbing, ["with_effects"], law, w)
-        away.append(thetas[-again.DRAWS :] - thetas[0])
+        away.append(thetas[-again.SEVERAL :] - thetas[0])
     assert np.ptp(away[0], axis=0).max() > 0
     assert not np.allclose(away[0], away[1], rtol=0.01) and not np.allclose(away[1], away[2], rtol=0.01)
 
