@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg
+import mujoco
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -18,7 +19,7 @@ from bayessim_mjx import linalg
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
     from mujoco import mjx
 
-__all__ = ["compiler_options", "mjx", "program", "put_replicated", "supply"]
+__all__ = ["compiler_options", "mass_matrix", "mjx", "program", "put_replicated", "supply"]
 
 CHAIN = 5  # bodies, one after the other, from which on a robot is a long chain
 DEEP = 8  # bodies likewise, from which on the options pay for trees with limbs too: they compile faster
@@ -157,3 +158,11 @@ def _serial(model: Any) -> bool:
     for parent in parents[1:]:
         depth.append(depth[parent] + 1)
     return max(depth) >= DEEP or (max(depth) >= CHAIN and len(parents) - 1 < 2 * max(depth))
+
+
+def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """`[nv, nv]`, by its product with each unit vector (the same call in every MuJoCo)."""
+    out = np.zeros((model.nv, model.nv))
+    for column, unit in zip(out, np.eye(model.nv), strict=True):
+        mujoco.mj_mulM(model, data, column, unit)
+    return out

@@ -8,8 +8,6 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 
 import mujoco
-import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from bayessim_mjx.effects.support.site import element_names
@@ -17,7 +15,6 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.parameters.attributes import suggest
 
-Array = NDArray[np.float64]
 # The accuracy of numbers for which nobody states one is inferred, one for each kind (masses, armatures, dampings,
 # frictions). Prior of its square: scaled inverse chi-squared, SURE degrees of freedom around ACCURACY. The error of one
 # number is then a Student t. Its median, 90 % and 95 % ranges (.057, .20, .30) are close to those of normal errors with
@@ -81,14 +78,6 @@ def rating(texts: Sequence[str], model: mujoco.MjModel) -> dict[int, float]:
         if name and name not in names:
             raise UserError(f"--payload {part}: no moving body {name!r}; {suggest(name, names)}")
         out |= dict.fromkeys([names[name]] if name else moving, mass)
-    return out
-
-
-def rated(carried: Array, given: Mapping[int, float]) -> Array:
-    """`[nbody]` kg that may be on each body: as stated, else as found."""
-    out = np.array(carried, float)
-    for body, mass in given.items():
-        out[body] = mass
     return out
 
 

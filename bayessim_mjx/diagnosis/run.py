@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -35,7 +34,7 @@ from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup, prepare
 from bayessim_mjx.diagnosis.summary import again
-from bayessim_mjx.diagnosis.summary.files import Files
+from bayessim_mjx.diagnosis.summary.files import Files, header
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.log import Log
 
@@ -176,15 +175,18 @@ def diagnose(
     Raises:
         UserError: model, logs, effects or tolerance are not usable.
     """
+    given: list[Any] = [logs] if isinstance(logs, str | Path | Log) else list(logs)
+    flags = [[texts] if isinstance(texts, str) else texts for texts in (accuracy, payload, tolerance)]
     with noting() as noticed:
-        robot = robot_of(model, parameters).stated(_several(accuracy), _several(payload))
-        given = [logs] if isinstance(logs, str | Path | Log) else list(logs)
-        recorded = _recorded(given, robot.mj_model, map)
-    about = _header(robot, model, given, recorded) | {"seed": seed} | dict(about or {})
+        robot = robot_of(model, parameters).stated(*flags[:2])
+        recorded = given
+        if not all(isinstance(log, Log) for log in given):
+            recorded = read_logs(given if len(given) > 1 else given[0], robot.mj_model, map, partial=True)
+    about = header(robot, model, given, recorded) | {"seed": seed} | dict(about or {})
     files = Files(None if out is None else Path(out), about, progress, early)
     request = Request(
         effects=effects, group=group, seed=seed, minutes=minutes, quick=quick, verdict_only=verdict_only,
-        tolerances=_several(tolerance), notes=(*notes, *noticed), remember=files.search,
+        tolerances=flags[2], notes=(*notes, *noticed), remember=files.search,
     )  # fmt: skip
     try:
         found = investigate(robot, recorded, request, files)
@@ -197,7 +199,8 @@ def remembering(setup: Setup, folder: Path | None) -> Setup:
     """Return the setup with a fitter that stores its fits in a folder, and finds those of an interrupted search."""
     if folder is None:
         return setup
-    return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, *_asked(setup))))
+    digests = _asked(setup)
+    return replace(setup, fitter=Remembering(setup.fitter, Journal(folder, *digests)))
 
 
 def _asked(setup: Setup) -> tuple[str, str]:
@@ -219,18 +222,6 @@ def _asked(setup: Setup) -> tuple[str, str]:
     return digest(*question), digest(*code)
 
 
-def _header(robot: Robot, model: Source, logs: Sequence[str | Path | Log], recorded: Sequence[Log]) -> dict[str, Any]:
-    """Return entries of the report's header."""
-    return {
-        "robot": robot.name,
-        "model": str(model) if isinstance(model, str | Path) else robot.name,
-        "data": [log.name if isinstance(log, Log) else str(log) for log in logs],
-        "logs": len(recorded),
-        "seconds": float(sum(log.duration for log in recorded)),
-        "date": time.strftime("%Y-%m-%d %H:%M"),
-    }
-
-
 @contextmanager
 def noting() -> Iterator[list[str]]:
     """Return a list that holds the warnings of its block, each once, when the block ends."""
@@ -239,13 +230,3 @@ def noting() -> Iterator[list[str]]:
         warnings.simplefilter("always", UserWarning)
         yield notes
     notes += dict.fromkeys(str(w.message) for w in caught)
-
-
-def _recorded(given: list[Any], model: mujoco.MjModel, map: str | Path | None) -> list[Log]:
-    if all(isinstance(log, Log) for log in given):
-        return given
-    return read_logs(given if len(given) > 1 else given[0], model, map, partial=True)
-
-
-def _several(texts: str | Sequence[str]) -> Sequence[str]:
-    return [texts] if isinstance(texts, str) else texts

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.equation_error import inverse_dynamics_check
-from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
+from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look, looked
 from bayessim_mjx.diagnosis.fitting import (
     candidates,
     command_shift,
@@ -23,8 +23,7 @@ from bayessim_mjx.diagnosis.fitting import (
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, at_most, finest, most_windows, windows_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES
-from bayessim_mjx.diagnosis.fitting.robot import Robot, pruned
-from bayessim_mjx.diagnosis.fitting.simulable import contacts
+from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts, pruned
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck import gate, noise
@@ -147,7 +146,8 @@ def prepare(
     checked = _checked(robot, logs, request, looked)
     usable = checked.gate.usable
     size = scales.measure(checked.robot.mj_model, [resample(log, checked.dt) for log in usable], robot.rating)
-    stack, left_out = candidates.stack(candidates.kinds_of(request.effects), size)
+    kinds = candidates.kinds_of(request.effects)
+    stack, left_out = candidates.stack(kinds, size)
     allows = functools.partial(tolerated, 2 * size.travel)
     timed = _timed(checked, size, allows(noise.noise_of_positions(usable)).limit, request.group, budget)
     physics = physics_of(timed.robot, checked.dt, stack)
@@ -165,7 +165,7 @@ def prepare(
         *timed.warnings,
         *untried,
         *cut.notes,
-        *noise.not_compared(usable),
+        *notes.not_compared(usable),
         *few,
     ]
     own = Settings(screened=24) if robot.mj_model.nv > CUTTING.many else Settings()
@@ -190,14 +190,15 @@ def prepare(
 def _checked(robot: Robot, logs: Sequence[Log], request: Request, looked: Callable[[Look], None]) -> _Checked:
     """Return the logs after the gate, cut where they begin to be usable, and their notes."""
     dt, said = control_period(robot, logs), [*request.notes]
-    found, look = inverse_dynamics_check.checked(logs, robot, dt, said, looked)
+    found, look = _looked_at(logs, robot, dt, looked)
+    said += [look.note] if look.note else []
     seconds = at_most(robot.mj_model.nv, request.quick) * (CUTTING.window + AROUND)  # that all windows hold together
     beginnings, shorter = observation.shortened(found.demand(), seconds)
-    bases: list[Base] = []
-    found = found.of_logs(observation.completed(beginnings, robot.mj_model, bases))
+    whole, bases = observation.completed(beginnings, robot.mj_model)
+    found = found.of_logs(whole)
     said += [*found.warnings, *shorter, *(f"{text} (found, not assumed)" for text in found.findings)]
-    said += [] if noise.repeats(found.usable) else [noise.ONCE]
-    return _Checked(pruned(robot, found.usable, dt), dt, found, look, tuple(said), tuple(bases))
+    said += [] if noise.repeats(found.usable) else [notes.NO_REPEATS]
+    return _Checked(pruned(robot, found.usable, dt), dt, found, look, tuple(said), bases)
 
 
 def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | None, budget: Budget) -> _Timed:
@@ -233,7 +234,8 @@ def _measured(
     while True:
         cuts = windows_of(own, usable, group, use_qvel, seconds, first)
         steps = cuts(1).steps
-        step = discretisation.measure(own, cuts, usable, finest(own, len(cuts(1)), steps), first=first, limit=limit)
+        fine = finest(own, len(cuts(1)), steps)
+        step = discretisation.measure(own, cuts, usable, fine, first=first, limit=limit)
         if not (contacts(own) and step.lottery) or steps == RULES.parts:
             return cuts, step
         seconds /= 2
@@ -249,3 +251,15 @@ def _shift(
     return command_shift.estimate(
         step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
     )
+
+
+def _looked_at(logs: Sequence[Log], robot: Robot, dt: float, say: Callable[[Look], None]) -> tuple[gate.Gate, Look]:
+    """Run the gate after the look, which is faster and said at once; again where the gate refuses more logs."""
+    sound = [log for log in logs if not gate.unusable(log, dt)]
+    seen = looked(sound, robot)
+    say(seen)
+    found = gate.check(logs, robot.mj_model, dt)
+    if 0 < len(found.usable) < len(sound):
+        seen = looked(found.usable, robot)
+        say(seen)
+    return found, seen

@@ -201,17 +201,11 @@ def _base(track: Track, inputs: Inputs, sensors: Sequence[Sensor], noise: Array)
     )
 
 
-def of_logs(logs: Sequence[Log], model: mujoco.MjModel, bases: list[Base] | None) -> tuple[Log, ...] | None:
-    """Return the logs completed by the motion of a floating base that shows in a gyroscope; None: there is none.
-
-    bases: to which the estimates are appended.
-    """
+def of_logs(logs: Sequence[Log], model: mujoco.MjModel) -> list[tuple[Log, Base | None]]:
+    """Return each log completed by the motion of a floating base that shows in a gyroscope; empty: there is none."""
     if not any(having(log.streams, "gyro") and feet.lost_base(log, model) for log in logs):
-        return None
-    pairs = [completed(log, model) if log.lost else (log, None) for log in logs]
-    if bases is not None:
-        bases += [found for _, found in pairs if found is not None]
-    return tuple(log for log, _ in pairs)
+        return []
+    return [completed(log, model) if log.lost else (log, None) for log in logs]
 
 
 def completed(log: Log, model: mujoco.MjModel) -> tuple[Log, Base | None]:

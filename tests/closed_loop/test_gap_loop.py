@@ -11,7 +11,7 @@ from bayessim_mjx import gap_loop, registry, rl
 from bayessim_mjx.closed_loop import judge, measures, words
 from bayessim_mjx.diagnosis import correction
 from bayessim_mjx.diagnosis.fitting.robot import of_task
-from bayessim_mjx.diagnosis.summary import written
+from bayessim_mjx.diagnosis.summary import files
 from bayessim_mjx.monitor.writer import event_files, records
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Drive, control_step, controllers
@@ -46,7 +46,7 @@ def folder(tmp_path_factory, robot):
     for name, found, known in (("truth", TRUTH, MASS), ("wrong", WRONG, {})):
         made = diagnosis(found, known)
         made.save(root / name)
-        written.write_outputs(made, robot, root / name)
+        files.write_outputs(made, robot, root / name)
     return root
 
 

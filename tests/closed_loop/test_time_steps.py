@@ -8,7 +8,7 @@ import pytest
 from bayessim_mjx import gap_loop, registry
 from bayessim_mjx.closed_loop import study
 from bayessim_mjx.diagnosis.fitting.robot import of_task
-from bayessim_mjx.diagnosis.summary import written
+from bayessim_mjx.diagnosis.summary import files
 from tests.diagnosis.handwritten import diagnosis
 
 SMALL = ["--iterations=8", "--episodes=16", "env.episodeLength=40", "ppo.num_envs=8", "--headless", "--device=cpu"]
@@ -18,7 +18,7 @@ def test_the_corrected_simulator_and_the_surrogate_have_time_steps_of_their_own(
     """And policies that were trained at another one are not taken up."""
     robot, found = of_task(registry.make("Pendulum")), diagnosis([("actuator_gain", "torque", {"gain": (0.6, 0.03)})])
     found.save(tmp_path)
-    written.write_outputs(found, robot, tmp_path)
+    files.write_outputs(found, robot, tmp_path)
 
     def made(*more):
         given = ["--task", "Pendulum", "--diagnosis", str(tmp_path), "--surrogate", str(tmp_path / "effects.yaml")]

@@ -11,7 +11,7 @@ import pytest
 from bayessim_mjx import config, registry
 from bayessim_mjx.diagnosis import correction, result
 from bayessim_mjx.diagnosis.fitting.robot import of_file, of_task
-from bayessim_mjx.diagnosis.summary import written
+from bayessim_mjx.diagnosis.summary import files
 from bayessim_mjx.effects.support import storage
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
@@ -166,7 +166,7 @@ def test_a_place_that_the_model_has_not_is_refused(robot):
 def test_effects_yaml_simulates_like_apply(robot, corrected, tmp_path):
     FOUND.save(tmp_path)
     loaded = result.load(tmp_path)  # what a later command has
-    sentences = written.write_outputs(loaded, robot, tmp_path)
+    sentences = files.write_outputs(loaded, robot, tmp_path)
     settings = config.load("Pendulum", overrides=[f"effects={tmp_path}/effects.yaml"])
     env = registry.make("Pendulum", config=settings)
     np.testing.assert_allclose(
@@ -177,7 +177,7 @@ def test_effects_yaml_simulates_like_apply(robot, corrected, tmp_path):
 
 
 def test_the_mjcf_has_what_mujoco_can_express(robot, tmp_path):
-    written.write_outputs(FOUND, robot, tmp_path)
+    files.write_outputs(FOUND, robot, tmp_path)
     text = (tmp_path / "model_with_effects.xml").read_text()
     model = mujoco.MjModel.from_xml_string(text)
     assert model.dof_frictionloss[0] == pytest.approx(0.3)
@@ -194,7 +194,7 @@ def test_the_mjcf_has_what_mujoco_can_express(robot, tmp_path):
 
 def test_known_parameters_without_estimates_stay_out_of_the_file(arm, tmp_path):
     one = diagnosis([], {"upper_mass_mult": (0.9, 0.02)})
-    assert written.write_outputs(one, arm, tmp_path) == []
+    assert files.write_outputs(one, arm, tmp_path) == []
     (p,) = storage.read(tmp_path / "effects.yaml").calibrated
     assert (p.name, p.mean, p.sd, p.low) == ("upper_mass_mult", 0.9, 0.02, pytest.approx(0.3))
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "model_with_effects.xml"))
@@ -222,7 +222,7 @@ def test_meshes_are_found_from_the_new_place(tmp_path):
     )
     out = tmp_path / "found"
     out.mkdir()
-    written.write_outputs(
+    files.write_outputs(
         diagnosis([("coulomb_friction", "j", {"level": (0.3, 0.1)})]), of_file(folder / "robot.xml"), out
     )
     model = mujoco.MjModel.from_xml_path(str(out / "model_with_effects.xml"))

@@ -73,7 +73,6 @@ def test_accuracies_that_make_no_sense(arm, text):
 def test_a_rating_holds_on_every_body_or_on_one(arm):
     assert data_sheet.rating(("12kg",), arm.mj_model) == {1: 12.0, 2: 12.0}
     assert data_sheet.rating(("lower=3", "5"), arm.mj_model) == {1: 5.0, 2: 3.0}
-    assert data_sheet.rated(np.array([0.0, 1.0, 1.0]), {2: 7.0}) == pytest.approx([0.0, 1.0, 7.0])
     for text in ("hand=3", "heavy", "lower=-1kg"):
         with pytest.raises(UserError, match="--payload"):
             data_sheet.rating((text,), arm.mj_model)

@@ -127,8 +127,7 @@ def test_an_orientation_sensor_narrows_the_tilt(model, swayed):
 
 def test_rates_are_compared_and_the_rest_of_the_base_is_not(model, swayed):
     log, _, twist, _ = swayed
-    found: list[base.Base] = []
-    (done,) = observation.completed([log], model, found)
+    (done,), found = observation.completed([log], model)
     assert done.has_qvel and list(done.seen_speeds) == [False] * 3 + [True] * 3 + [False]
     assert list(done.seen_dofs) == [False] * 6 + [True]
     sigma_q, sigma_v, spread = noise_of([done], [done], use_qvel=True)
@@ -156,8 +155,7 @@ def test_a_base_that_a_weld_holds_has_no_motion_to_estimate(swayed):
     held = mujoco.MjModel.from_xml_string(
         STOOL.replace("</worldbody>", "</worldbody><equality><weld body1='trunk'/></equality>")
     )
-    found: list[base.Base] = []
-    (done,) = observation.completed([swayed[0]], held, found)
+    (done,), found = observation.completed([swayed[0]], held)
     assert done.qpos[:, :7] == pytest.approx(np.tile(held.qpos0[:7], (len(done), 1))) and not found
     assert not done.has_qvel and not done.seen_dofs[:6].any() and (done.sigma_dofs[:6] < 1e-3).all()
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.equation_error.sums import Layout, Sums
 from bayessim_mjx.diagnosis.logcheck.drives import FLOOR
-from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 from bayessim_mjx.diagnosis.statistics import times
 
@@ -100,12 +99,6 @@ def _spans(terms: Sequence[Term]) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
 
 
-def used(sums: Sums) -> NDArray[np.bool_]:
-    """`[nv]`: joints whose effort is known and that moved."""
-    known = np.array([s != "" for s in sums.source])
-    return known & (sums.rows >= FEWEST) & (sums.size > 0)
-
-
 def left(sums: Sums, model: Array) -> Array:
     """`[nv]`, mean squares of what a model leaves."""
     rest = -model
@@ -115,7 +108,7 @@ def left(sums: Sums, model: Array) -> Array:
 
 def fit(sums: Sums, terms: Sequence[Term]) -> Fit:
     """Least squares of all terms together, by Gauss-Newton steps: a scale times a sum is not linear."""
-    on, spans, size = used(sums), _spans(terms), sum(t.count for t in terms)
+    on, spans, size = sums.used, _spans(terms), sum(t.count for t in terms)
     floor = (FLOOR * np.maximum(sums.size, 1e-12)) ** 2
     neutral, low, high = (
         np.concatenate([np.broadcast_to(getattr(t, e), t.count) for t in terms] or [np.zeros(0)])
@@ -168,9 +161,9 @@ def contribution(sums: Sums, found: Fit, term: Term) -> Array:
     values[found.at(term)] = term.neutral
     away = found.model - _effort(sums.layout, found.terms, _spans(found.terms), values)[0]
     power = np.sum(away * times(sums.gram, away), -1) / np.maximum(sums.rows, 1e-9)
-    return np.where(used(sums), np.sqrt(np.maximum(power, 0.0)) / np.maximum(sums.size, 1e-300), 0.0)
+    return np.where(sums.used, np.sqrt(np.maximum(power, 0.0)) / np.maximum(sums.size, 1e-300), 0.0)
 
 
 def evidence(sums: Sums, found: Fit) -> float:
     """Log density of all efforts and priors at the fit, up to a constant."""
-    return -0.5 * float(np.sum(np.where(used(sums), sums.rows * np.log(found.variance), 0.0))) - found.penalty
+    return -0.5 * float(np.sum(np.where(sums.used, sums.rows * np.log(found.variance), 0.0))) - found.penalty

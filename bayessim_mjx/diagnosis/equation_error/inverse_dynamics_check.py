@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,17 +15,16 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import data_sheet
 from bayessim_mjx.diagnosis.equation_error import fit as fitting
 from bayessim_mjx.diagnosis.equation_error import sums as summing
 from bayessim_mjx.diagnosis.equation_error import terms
 from bayessim_mjx.diagnosis.equation_error.closed_loops import OfModel
-from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term, used
-from bayessim_mjx.diagnosis.equation_error.search import STRONG, Found, Proposal, contradicted, search
+from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term
+from bayessim_mjx.diagnosis.equation_error.search import STRONG, Found, Proposal, contradicted, described
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, base_coordinates
 from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.logcheck import drives, gate
+from bayessim_mjx.diagnosis.logcheck import drives
 from bayessim_mjx.diagnosis.logcheck.links import Channel, channels_of
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.physics import controllers
@@ -79,6 +78,7 @@ class Look:
         shifts: known parameters that move with the proposals; of those that hardly move nothing is said.
         vetoes: {label of a candidate: why it is contradicted}.
         unknown: bodies whose mass these logs tell less of than the data sheet.
+        note: why nothing was seen.
     """
 
     channels: tuple[Channel, ...] = ()
@@ -90,6 +90,7 @@ class Look:
     vetoes: Mapping[str, str] = field(default_factory=dict)
     unknown: tuple[str, ...] = ()
     seconds: float = 0.0
+    note: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         rows = [
@@ -120,18 +121,18 @@ def check(
     """
     began = time.monotonic()
     sums = summing.gather(logs, model)
-    if not used(sums).any():
+    if not sums.used.any():
         return Look(seconds=time.monotonic() - began)
     known = terms.known(model, sums.layout, accuracy or {}, sums.period)
     places = [log.qpos for log in summing.shortened(logs)]
-    carried = data_sheet.rated(drives.carried(model, np.concatenate(places)), rating or {})
+    carried = drives.carried(model, np.concatenate(places), rating)
     offered = terms.effects(model, sums.layout, sums.source, carried, controllers.of_logs(logs, model))
     stated = all(str(log.metadata.get("effort_unit", "")) in UNITS for log in logs)
     own = OfModel(logs, model)
-    found, unit = _searched(sums, known, offered, stated)
+    found, unit = described(sums, known, offered, stated)
     while doubtful := own.artefacts(known, found):
         offered = [t for t in offered if t.label not in doubtful]
-        found, unit = _searched(sums, known, offered, stated)
+        found, unit = described(sums, known, offered, stated)
     # the model as it is; how late efforts are logged is no fault of it
     nominal = fitting.fit(sums, [t for t in known if t.effect == "lateness"])
     channels = channels_of(logs, model, unit == 1.0)
@@ -149,22 +150,8 @@ def check(
     )
 
 
-def _searched(sums: Sums, known: Sequence[Term], offered: Sequence[Term], stated: bool) -> tuple[Found, float]:
-    """Describe the search's result and the unit of the efforts: free where none is stated, unless it is 1."""
-    measured = np.array(sums.source) == "effort"
-    if stated or not measured.any():
-        return search(sums, known, offered), 1.0
-    unit = terms.scale("effort_unit", "all", measured)
-    others = [t for t in offered if (t.effect, t.where) != ("actuator_gain", "all")]
-    found = search(sums, [*known, unit], others)
-    factor = 1.0 / float(found.fit.of(unit)[0])
-    if abs(np.log(abs(factor) + 1e-12)) < terms.SURE:
-        return search(sums, known, offered), 1.0
-    return found, factor
-
-
 def _joints(model: mujoco.MjModel, sums: Sums, nominal: Fit, found: Found) -> tuple[Joint, ...]:
-    lay, on = sums.layout, used(sums)
+    lay, on = sums.layout, sums.used
     size = sums.size
     whole = sums.gram
     parts = [
@@ -193,7 +180,7 @@ def _shifts(known: Sequence[Term], found: Fit) -> tuple[Shift, ...]:
 
 def _explained(sums: Sums, nominal: Fit, found: Found) -> float:
     """Share that is explained of the squared effort that the model leaves, each joint in units of its own effort."""
-    size, on = sums.size, used(sums)
+    size, on = sums.size, sums.used
     before, after = (float(np.sum((fitting.left(sums, f.model) / size**2)[on])) for f in (nominal, found.fit))
     return 1.0 - after / before if before > 0 and found.proposals else float("nan")
 
@@ -226,33 +213,16 @@ class Proposals:
         ]
 
 
-def checked(
-    logs: Sequence[Log], robot: Robot, dt: float, notes: list[str], say: Callable[[Look], None]
-) -> tuple[gate.Gate, Look]:
-    """Run the gate after the look, which is faster and said at once; again where the gate refuses more logs."""
-    sound = [log for log in logs if not gate.unusable(log, dt)]
-    seen = looked(sound, robot, notes)
-    say(seen)
-    found = gate.check(logs, robot.mj_model, dt)
-    if 0 < len(found.usable) < len(sound):
-        seen = looked(found.usable, robot, notes)
-        say(seen)
-    return found, seen
-
-
-def looked(logs: Sequence[Log], robot: Robot, notes: list[str]) -> Look:
-    """Look before any simulation; a failure costs the race its leads, not the diagnosis, and is `told`."""
+def looked(logs: Sequence[Log], robot: Robot) -> Look:
+    """Look before any simulation; a failure costs the race its leads, not the diagnosis, and is noted."""
     lost = sorted({name for log in logs for name in log.lost})
     if lost:
         need = f"they need the motion of all joints, and {', '.join(lost)} was not measured"
-        text = f"checks and proposals before any simulation are left out: {need}"
-        notes += [text] if text not in notes else []  # the gate may ask for a second look
-        return Look()
+        return Look(note=f"checks and proposals before any simulation are left out: {need}")
     try:
         return check(logs, robot.mj_model, _deviations(robot), robot.rating)
     except Exception as error:
-        notes.append(f"equation errors: not available ({type(error).__name__}: {error})")
-        return Look()
+        return Look(note=f"equation errors: not available ({type(error).__name__}: {error})")
 
 
 def _deviations(robot: Robot) -> dict[tuple[str, str], float]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.data_sheet import DRIVES
 from bayessim_mjx.diagnosis.equation_error import fit as fitting
+from bayessim_mjx.diagnosis.equation_error import terms
 from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
 from bayessim_mjx.diagnosis.logcheck.drives import LEAST
@@ -217,3 +218,17 @@ def _unlike(channels: Sequence[Channel]) -> str:
     if high.scale - low.scale < 2 * LEAST + SURE * (low.deviation + high.deviation):
         return ""
     return f"{low.scale:.2g} of the command at {low.actuator}, {high.scale:.2g} at {high.actuator}"
+
+
+def described(sums: Sums, known: Sequence[Term], offered: Sequence[Term], stated: bool) -> tuple[Found, float]:
+    """Describe the search's result and the unit of the efforts: free where none is stated, unless it is 1."""
+    measured = np.array(sums.source) == "effort"
+    if stated or not measured.any():
+        return search(sums, known, offered), 1.0
+    unit = terms.scale("effort_unit", "all", measured)
+    others = [t for t in offered if (t.effect, t.where) != ("actuator_gain", "all")]
+    found = search(sums, [*known, unit], others)
+    factor = 1.0 / float(found.fit.of(unit)[0])
+    if abs(np.log(abs(factor) + 1e-12)) < terms.SURE:
+        return search(sums, known, offered), 1.0
+    return found, factor

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
-from bayessim_mjx.diagnosis.logcheck.regressor import Mask, Motion, Regressor, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Mask, Motion, Regressor, filtered, motion
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.support.actuators import OfGains
 from bayessim_mjx.logs.log import Log
@@ -89,6 +89,12 @@ class Sums:
     rows: Array
     source: tuple[str, ...]
     period: float
+
+    @cached_property
+    def used(self) -> Mask:
+        """`[nv]`: joints whose effort is known and that moved."""
+        known = np.array([s != "" for s in self.source])
+        return np.asarray(known & (self.rows >= FEWEST) & (self.size > 0))
 
     def power(self, column: int) -> Array:
         """`[nv]`, mean square of a column."""

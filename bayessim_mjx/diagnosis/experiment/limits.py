@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis.fitting.simulable import AXIAL
+from bayessim_mjx.diagnosis.fitting.robot import AXIAL
 from bayessim_mjx.diagnosis.logcheck.drives import commanded, dof_of
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Channels, Log

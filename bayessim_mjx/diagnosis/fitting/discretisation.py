@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting import quadratic
-from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.fitting.simulable import contacts
+from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
 from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, simulated
 from bayessim_mjx.diagnosis.fitting.observation import Stepper
-from bayessim_mjx.diagnosis.fitting.robot import Robot
-from bayessim_mjx.diagnosis.fitting.simulable import contacts
+from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts
 from bayessim_mjx.logs.log import Channels, Log
 
 Array = NDArray[np.float64]

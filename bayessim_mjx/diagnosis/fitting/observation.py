@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from bayessim_mjx.compat import mass_matrix
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
-from bayessim_mjx.diagnosis.fitting.scales import mass_matrix
 from bayessim_mjx.diagnosis.logcheck.drives import DeclaredLaw
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
@@ -61,25 +61,26 @@ def shortened(logs: Sequence[Log], seconds: float) -> tuple[tuple[Log, ...], lis
     return tuple(out), [text]
 
 
-def completed(logs: Sequence[Log], model: mujoco.MjModel, bases: list[base.Base] | None = None) -> tuple[Log, ...]:
+def completed(logs: Sequence[Log], model: mujoco.MjModel) -> tuple[tuple[Log, ...], tuple[base.Base, ...]]:
     """Complete the logs with the motion of joints that were not measured, and its standard deviations.
 
     Args:
         model: as it was delivered.
-        bases: to which the motion of a floating base that was estimated is appended, of each log.
+
+    Returns:
+        The logs, and the motion of a floating base that was estimated, of each log.
 
     Raises:
         UserError: what was measured does not tell the state of a joint.
     """
     if not any(log.lost for log in logs):
-        return tuple(logs)
-    floating = base.of_logs(logs, model, bases)
-    if floating is not None:
-        return floating
+        return tuple(logs), ()
+    if floating := base.of_logs(logs, model):
+        return tuple(log for log, _ in floating), tuple(found for _, found in floating if found is not None)
     _demand_axial(logs)
     ways = [_smoothed(log, model) if log.lost else None for log in logs]
     _demand([(log, way) for log, way in zip(logs, ways, strict=True) if way is not None], model)
-    return tuple(log if way is None else _with(log, way, model) for log, way in zip(logs, ways, strict=True))
+    return tuple(log if way is None else _with(log, way, model) for log, way in zip(logs, ways, strict=True)), ()
 
 
 @dataclass(frozen=True, eq=False)

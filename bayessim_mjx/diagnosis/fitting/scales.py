@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.diagnosis import data_sheet
+from bayessim_mjx.compat import mass_matrix
 from bayessim_mjx.diagnosis.logcheck import drives
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.site import element_names, floating
@@ -133,7 +133,7 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
         command=np.maximum(command, 1e-9),
         effort=effort,
         moves=ptp > 10 * noise + 1e-9,
-        carried=data_sheet.rated(drives.carried(model, np.array(places)), rating or {}),
+        carried=drives.carried(model, np.array(places), rating),
         period=float(np.median([log.period for log in logs])),
         loops=drives.loops_of(model, logs),
     )
@@ -159,14 +159,6 @@ def _span(model: mujoco.MjModel, log: Log) -> Array:
     for row, qpos in zip(away, log.qpos, strict=True):
         mujoco.mj_differentiatePos(model, row, 1.0, log.qpos[0], qpos)
     return np.ptp(away, axis=0) if len(log) else np.zeros(model.nv)
-
-
-def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
-    """`[nv, nv]`, by its product with each unit vector (the same call in every MuJoCo)."""
-    out = np.zeros((model.nv, model.nv))
-    for column, unit in zip(out, np.eye(model.nv), strict=True):
-        mujoco.mj_mulM(model, data, column, unit)
-    return out
 
 
 def ranges(effect: type[Effect], place: str, scales: Scales) -> tuple[Parameter, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -155,21 +155,19 @@ def efforts(log: Log, model: mujoco.MjModel) -> Iterator[Effort]:
 # What the drives can carry, and how far out: the scale of an unknown payload
 
 
-def carried(model: mujoco.MjModel, places: Array) -> Array:
-    """kg that the drives hold at each body `[nbody]`, at rest in all of some places, at most what the robot weighs.
+def carried(model: mujoco.MjModel, places: Array, rating: Mapping[int, float] | None = None) -> Array:
+    """kg that may be on each body `[nbody]`: as rated, else as the drives hold at rest in all of some places.
 
-    At every joint m g lever <= force limit + own gravity torque, which the load may balance. Joints without a drive
-    hold nothing and rule nothing out; nor do drives without a limit.
+    At every joint m g lever <= force limit + own gravity torque, which the load may balance; at most the robot's own
+    weight. Joints without a drive hold nothing and rule nothing out; nor do drives without a limit.
 
     Args:
-        places: `[T, nq]`, positions that were logged.
+        places: `[T, nq]`, positions that were logged; rating: {body: kg}, of a data sheet.
     """
     limit = force_limits(model)
     out = np.array([weight(model, b) for b in range(model.nbody)])
-    if not np.isfinite(limit).any():
-        return out
     data, jacobian = mujoco.MjData(model), np.zeros((3, model.nv))
-    for qpos in places:
+    for qpos in places if np.isfinite(limit).any() else ():
         data.qpos[:] = qpos
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
@@ -178,6 +176,8 @@ def carried(model: mujoco.MjModel, places: Array) -> Array:
             mujoco.mj_jacBodyCom(model, data, jacobian, None, int(body))
             torque = np.abs(model.opt.gravity @ jacobian)  # N m per kg
             out[body] = np.min(room[torque > 0] / torque[torque > 0], initial=out[body])
+    for stated, mass in (rating or {}).items():
+        out[stated] = mass
     return out
 
 
@@ -215,15 +215,6 @@ def weight(model: mujoco.MjModel, body: int) -> float:
 def reach(model: mujoco.MjModel, body: int) -> float:
     """m from the body's centre of mass to that of what it may carry: beyond the body itself, a tool's length."""
     return max(BESIDE * size(model, body), OUT * _length(model, body))
-
-
-def at_the_ends(model: mujoco.MjModel) -> Iterator[tuple[int, Array, float]]:
-    """(body, place `[3]` m in its frame, kg that may be there), at and around the last links' centres of mass."""
-    jointed = np.flatnonzero(model.body_jntnum)
-    above = {int(model.body_weldid[model.body_parentid[b]]) for b in jointed}
-    for body in (int(b) for b in jointed if int(b) not in above):
-        for side in np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]):
-            yield body, model.body_ipos[body] + reach(model, body) * side, weight(model, body)
 
 
 def _length(model: mujoco.MjModel, body: int) -> float:

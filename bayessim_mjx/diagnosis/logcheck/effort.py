@@ -5,14 +5,13 @@ Bounds keep friction from standing in for a robot that is not there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.logcheck import drives
-from bayessim_mjx.diagnosis.logcheck.drives import LEAST, Effort, efforts
+from bayessim_mjx.diagnosis.logcheck.drives import LEAST, Effort, efforts, reach, weight
 from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, LOOSE, Bounded, Mask, Regressor, filtered, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial, moving_bodies, nominal
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding
@@ -143,7 +142,7 @@ class _Picture:
     def of(cls, log: Log, model: mujoco.MjModel, cutoff: float) -> _Picture:
         inertia, moving = nominal(model), moving_bodies(model)
         sets, most = list(np.eye(len(moving))[:, :, None] * inertia), []
-        for body, place, heaviest in drives.at_the_ends(model):
+        for body, place, heaviest in _at_the_ends(model):
             sets.append(np.zeros_like(inertia))
             sets[-1][moving.index(body)] = inertial(1.0, place, np.zeros((3, 3)))
             most.append(heaviest)
@@ -250,3 +249,12 @@ def _in_radians(log: Log, mj_model: mujoco.MjModel, test: _Test) -> float:
         return 0.0
     radians = replace(log, qpos=np.radians(log.qpos), qvel=np.radians(log.qvel))
     return _Test.of(radians, test.effort, _Picture.of(radians, mj_model, test.cutoff)).share()
+
+
+def _at_the_ends(model: mujoco.MjModel) -> Iterator[tuple[int, Array, float]]:
+    """(body, place `[3]` m in its frame, kg that may be there), at and around the last links' centres of mass."""
+    jointed = np.flatnonzero(model.body_jntnum)
+    above = {int(model.body_weldid[model.body_parentid[b]]) for b in jointed}
+    for body in (int(b) for b in jointed if int(b) not in above):
+        for side in np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]):
+            yield body, model.body_ipos[body] + reach(model, body) * side, weight(model, body)

@@ -19,7 +19,7 @@ from bayessim_mjx.diagnosis.experiment.propose import SIZE
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.discretisation import refined
-from bayessim_mjx.diagnosis.fitting.simulable import contacts
+from bayessim_mjx.diagnosis.fitting.robot import contacts
 from bayessim_mjx.diagnosis.fitting.simulator import FAR, Simulator, physics_of
 from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.diagnosis.request import Tolerance

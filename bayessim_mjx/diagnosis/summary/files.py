@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from bayessim_mjx import atomic
+from bayessim_mjx import atomic, urdf
+from bayessim_mjx.diagnosis.correction import Found, correction
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting import journal
-from bayessim_mjx.diagnosis.fitting.robot import Robot
+from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, one_line
 from bayessim_mjx.diagnosis.phrases import first_look
 from bayessim_mjx.diagnosis.result import Diagnosis, load, plain
 from bayessim_mjx.diagnosis.selection.budget import Progress
@@ -24,8 +27,10 @@ from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.diagnosis.statistics import of_one
 from bayessim_mjx.diagnosis.summary import assemble
-from bayessim_mjx.diagnosis.summary.written import write_outputs
+from bayessim_mjx.effects.support import native, storage
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.log import Log
+from bayessim_mjx.parameters import ParameterSpace
 
 PRELIMINARY = "preliminary.json"  # results while the search goes on
 SEARCH = "search_so_far"  # folder of the fits
@@ -209,3 +214,88 @@ def _limits(e: Experiment) -> dict[str, Any]:
 
 def _short(*values: float) -> list[float]:
     return [float(f"{v:.6g}") for v in values]
+
+
+# The corrected simulator as files: effects.yaml, the model for plain MuJoCo, and a URDF where it came from one
+
+
+MODEL, URDF = "model_with_effects.xml", "model_with_effects.urdf"
+# what a URDF has elements for: effects, and attributes of recalibrated parameters
+IN_URDF = ("coulomb_friction", "viscous_friction", "payload", "inertial_parameters")
+CALIBRATED_IN_URDF = ("damping", "friction", "mass", "inertia", "com_x", "com_y", "com_z")
+
+
+def write_outputs(diagnosis: Found, robot: Robot, folder: str | Path) -> list[str]:
+    """Write effects.yaml and, where the robot has a specification, model_with_effects.xml; of a URDF, a URDF too.
+
+    Returns:
+        One sentence for each thing that a file leaves out because its format has no element for it.
+    """
+    folder = Path(folder)
+    found = correction(diagnosis, robot.space)
+    effects, calibrated = found.effects, ParameterSpace(found.calibrated)
+    every = [*calibrated.parameters, *(p for e in effects for p in e.space().parameters)]
+    identified = {p.name: (p.mean, p.sd) for p in every if p.mean is not None and p.sd is not None}
+    storage.write(folder / "effects.yaml", effects, identified, calibrated)
+    for name in (MODEL, URDF):  # of an earlier diagnosis
+        (folder / name).unlink(missing_ok=True)
+    if robot.spec is None:
+        return [f"{MODEL} is not written: a compiled model has no specification; give its MJCF or MjSpec"]
+    source = robot.spec()
+    spec, missing = native.write_model(source, calibrated, calibrated.nominal, effects)
+    spec = _friction_acting(_at_home(spec, source.modelfiledir))
+    left_out = "".join(f"  {sentence}\n" for sentence in missing)
+    note = f"<!-- Not in this model:\n{left_out.replace('--', '- -')}-->\n" if missing else ""
+    (folder / MODEL).write_text(note + spec.to_xml(), encoding="utf-8")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(folder / MODEL))
+    except ValueError as error:
+        return [f"{MODEL} does not load, use effects.yaml: {one_line(error)}"]
+    said = [f"{MODEL} leaves out {sentence}" for sentence in missing]
+    if robot.urdf is None:
+        return said
+    (folder / URDF).write_text(urdf.corrected(robot.urdf, source.compile(), model), encoding="utf-8")
+    lacks = [f"{e.name} at {', '.join(e.places())}" for e in effects if e.name not in IN_URDF]
+    lacks += [p.name for p in found.calibrated if p.attribute not in CALIBRATED_IN_URDF]
+    has = "a URDF has friction and damping of joints and inertias of links"
+    return [*said, *([f"{URDF} leaves out {', '.join(lacks)}: {has}"] if lacks else [])]
+
+
+def _friction_acting(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Native friction is a constraint: where constraints are off as a whole, all others are now off one by one."""
+    off = mujoco.mjtDisableBit
+    if any(joint.frictionloss > 0 for joint in spec.joints):
+        flags = int(spec.option.disableflags) & ~int(off.mjDSBL_FRICTIONLOSS)
+        if flags & int(off.mjDSBL_CONSTRAINT):
+            others = int(off.mjDSBL_CONTACT) | int(off.mjDSBL_LIMIT) | int(off.mjDSBL_EQUALITY)
+            flags = flags & ~int(off.mjDSBL_CONSTRAINT) | others
+        spec.option.disableflags = flags
+    return spec
+
+
+def _at_home(spec: mujoco.MjSpec, folder: str) -> mujoco.MjSpec:
+    """Return the specification with its meshes and textures where they are, wherever its XML will lie."""
+    assets = [*spec.meshes, *spec.hfields, *spec.skins]
+    if not any(asset.file for asset in (*assets, *spec.textures)):
+        return spec
+    home = Path(folder).resolve()  # "": of a file that was named without its folder
+    meshes, textures = spec.meshdir, spec.texturedir
+    spec.meshdir, spec.texturedir = str((home / meshes).resolve()), str((home / textures).resolve())
+    for asset, below in [*((asset, meshes) for asset in assets), *((texture, textures) for texture in spec.textures)]:
+        # in full where it does not lie in the model's own folder of assets: an attached model's
+        if folder and asset.file and not (home / below / asset.file).is_file():
+            found = [path for path in home.rglob(Path(asset.file).name) if path.match(asset.file)]
+            asset.file = str(found[0]) if len(found) == 1 else asset.file
+    return spec
+
+
+def header(robot: Robot, model: Source, logs: Sequence[str | Path | Log], recorded: Sequence[Log]) -> dict[str, Any]:
+    """Return entries of the report's header."""
+    return {
+        "robot": robot.name,
+        "model": str(model) if isinstance(model, str | Path) else robot.name,
+        "data": [log.name if isinstance(log, Log) else str(log) for log in logs],
+        "logs": len(recorded),
+        "seconds": float(sum(log.duration for log in recorded)),
+        "date": time.strftime("%Y-%m-%d %H:%M"),
+    }

@@ -44,7 +44,7 @@ def recorded(folder, xml, joint):
     np.savetxt(folder / "a.csv", rows, delimiter=",", header=f"time,ctrl:drive,qpos:{joint}", comments="")
     with pytest.warns(UserWarning, match="this motion is estimated from what was measured"):
         (log,) = read_logs([folder / "a.csv"], model, partial=True)
-    (done,) = observation.completed([log], model)
+    (done,), _ = observation.completed([log], model)
     return model, done
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis import setup
-from bayessim_mjx.diagnosis.fitting import discretisation, integrator_choice, robot, simulable
+from bayessim_mjx.diagnosis.fitting import discretisation, integrator_choice, robot
 from bayessim_mjx.diagnosis.fitting.cutting import windows_of
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
@@ -158,8 +158,8 @@ def test_the_coarsest_that_is_fine_enough_is_chosen():
 
 def test_where_nothing_touches_there_are_no_contacts():
     ball = MASS.replace('contype="0" conaffinity="0"', "").replace("<body>", '<geom type="plane" size="1 1 1"/><body>')
-    assert simulable.contacts(the(ball).physics(PERIOD))
-    assert not simulable.contacts(the(ARM).physics(PERIOD))
+    assert robot.contacts(the(ball).physics(PERIOD))
+    assert not robot.contacts(the(ARM).physics(PERIOD))
 
 
 @pytest.mark.parametrize(("touching", "steps"), [(True, 25), (False, 50)])

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.fitting import robot, simulable
+from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.robot import robot_of
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.setup import prepare
@@ -45,7 +45,7 @@ def log(model, *spans):
 )
 def test_limits_farther_than_a_quarter_of_the_travel_are_not_reached(a, b, away):
     model = mujoco.MjModel.from_xml_string(ARM)
-    assert simulable.unreached(model, [log(model, a, b, (0, 1)), log(model, (0, 0.1), (0, 0.1), (0, 1))]) == away
+    assert robot.unreached(model, [log(model, a, b, (0, 1)), log(model, (0, 0.1), (0, 0.1), (0, 1))]) == away
 
 
 @pytest.mark.slow

@@ -41,6 +41,7 @@ def test_the_drives_hold_so_much_by_hand():
     assert weak[1] > weak[3]  # nearer to the joint
     hanging = drives.carried(compiled(('actuatorfrcrange="-20 20"', LIMITS[1])), np.array([[np.pi / 2, 0.0]]))
     assert hanging[3] == pytest.approx(9.2)  # no lever
+    assert drives.carried(compiled(), np.zeros((1, 2)), {3: 7.0}).tolist() == [*held[:3], 7.0]  # as rated
 
 
 def test_limits_of_force_and_command_count_through_the_gear():

@@ -10,7 +10,7 @@ import pytest
 from bayessim_mjx import effects as library
 from bayessim_mjx import urdf
 from bayessim_mjx.diagnosis.fitting.robot import of_file, robot_of
-from bayessim_mjx.diagnosis.summary import written
+from bayessim_mjx.diagnosis.summary import files
 from bayessim_mjx.effects.effect import in_order
 from bayessim_mjx.rollout import replay
 from tests.diagnosis.handwritten import diagnosis
@@ -147,11 +147,11 @@ def test_the_written_model_moves_as_the_corrected_simulator(name, tmp_path):
     assert np.abs(nominal - by_mujoco(mj, start)).max() < 1e-5
     for effect, own, ours in zip(effects, values, every[1:], strict=True):
         places = [(effect.name, place, {q: (x, 0.01) for q, x in own.items()}) for place in effect.places()]
-        left_out = written.write_outputs(diagnosis(places), robot, tmp_path)
+        left_out = files.write_outputs(diagnosis(places), robot, tmp_path)
         if left_out:  # a servo with an activation has no second one
             assert (name, effect.name) in {("timeconst", "actuator_lag")}
             continue
-        there = mujoco.MjModel.from_xml_path(str(tmp_path / written.MODEL))
+        there = mujoco.MjModel.from_xml_path(str(tmp_path / files.MODEL))
         lagging = range(mj.nu) if effect.name == "actuator_lag" else ()
         change = np.abs(ours - nominal).max()
         away = np.abs(by_mujoco(there, start, lagging) - ours).max()
@@ -173,8 +173,8 @@ def test_several_effects_at_once_and_recalibrated_masses_are_all_written(tmp_pat
     physics = made.apply(robot.physics(DT))
     state = start[None], np.zeros((1, 2)), commands(2)[None], physics.space.nominal[None]
     ours = np.asarray(replay(physics, *state)["qpos"])[0, 1:]
-    assert written.write_outputs(made, robot, tmp_path) == []
-    there = mujoco.MjModel.from_xml_path(str(tmp_path / written.MODEL))
+    assert files.write_outputs(made, robot, tmp_path) == []
+    there = mujoco.MjModel.from_xml_path(str(tmp_path / files.MODEL))
     assert np.abs(by_mujoco(robot.mj_model, start) - ours).max() > 0.1
     assert np.abs(by_mujoco(there, start) - ours).max() < 2e-4
 
@@ -213,15 +213,15 @@ def test_the_written_model_finds_its_meshes_from_another_folder(layout, tmp_path
     (tmp_path / "out").mkdir()
     monkeypatch.chdir(tmp_path / "robots")
     robot = of_file("robot.xml")  # from where the user stands
-    assert written.write_outputs(diagnosis([]), robot, tmp_path / "out") == []
+    assert files.write_outputs(diagnosis([]), robot, tmp_path / "out") == []
     monkeypatch.chdir(tmp_path / "out")
-    there = mujoco.MjModel.from_xml_path(written.MODEL)
+    there = mujoco.MjModel.from_xml_path(files.MODEL)
     assert there.nmesh == 1 and np.array_equal(there.body_inertia, robot.mj_model.body_inertia)
 
 
 def test_a_model_that_does_not_load_again_is_said_and_ends_nothing(tmp_path):
     spec = mujoco.MjSpec.from_string(LAYOUTS["beside"][1], assets={"m.obj": TETRAHEDRON.encode()})
-    (said,) = written.write_outputs(diagnosis([]), robot_of(spec), tmp_path)  # meshes of no file
+    (said,) = files.write_outputs(diagnosis([]), robot_of(spec), tmp_path)  # meshes of no file
     assert said.startswith("model_with_effects.xml does not load, use effects.yaml: ") and "m.obj" in said
 
 
@@ -248,12 +248,12 @@ def test_a_urdf_gives_a_urdf_with_friction_damping_and_inertias(tmp_path):
         ("armature", "elbow", {"inertia": (0.1, 0.01)}),
     ]
     found = diagnosis(effects, {"arm_mass_mult": (1.3, 0.01)})
-    (said,) = written.write_outputs(found, robot, tmp_path / "out")
+    (said,) = files.write_outputs(found, robot, tmp_path / "out")
     assert said.startswith("model_with_effects.urdf leaves out armature at elbow: a URDF has friction")
-    there, plain = urdf.read(tmp_path / "out" / written.URDF), of_file(tmp_path / "robot" / "r.urdf", drive="torque")
+    there, plain = urdf.read(tmp_path / "out" / files.URDF), of_file(tmp_path / "robot" / "r.urdf", drive="torque")
     urdf.drive(there, "torque")
-    there, full = there.compile(), mujoco.MjModel.from_xml_path(str(tmp_path / "out" / written.MODEL))
-    assert "<!-- of the maker -->" in (tmp_path / "out" / written.URDF).read_text()
+    there, full = there.compile(), mujoco.MjModel.from_xml_path(str(tmp_path / "out" / files.MODEL))
+    assert "<!-- of the maker -->" in (tmp_path / "out" / files.URDF).read_text()
     assert there.nmesh == plain.mj_model.nmesh == 1
     for field in ("dof_damping", "dof_frictionloss", "body_mass", "body_ipos"):
         np.testing.assert_allclose(getattr(there, field), getattr(full, field), rtol=1e-6, atol=1e-8)
@@ -270,6 +270,6 @@ def test_a_urdf_gives_a_urdf_with_friction_damping_and_inertias(tmp_path):
 
 
 def test_an_mjcf_gives_no_urdf(tmp_path):
-    put(tmp_path, {"robot.xml": ROBOTS["motors"], written.URDF: "of an earlier diagnosis"})
-    written.write_outputs(diagnosis([]), of_file(tmp_path / "robot.xml"), tmp_path)
-    assert not (tmp_path / written.URDF).exists()
+    put(tmp_path, {"robot.xml": ROBOTS["motors"], files.URDF: "of an earlier diagnosis"})
+    files.write_outputs(diagnosis([]), of_file(tmp_path / "robot.xml"), tmp_path)
+    assert not (tmp_path / files.URDF).exists()
