@@ -20,7 +20,7 @@ from bayessim_mjx.diagnosis.fitting import (
     observation,
     scales,
 )
-from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, at_most, finest, most_windows, windows_of
+from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, windows_of
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES
 from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts, pruned
@@ -122,7 +122,7 @@ class _Timed:
     def cut(self, physics: Physics, quick: bool) -> Windows:
         """Return the windows that models are fitted to."""
         steps = self.step.errors.cut.steps if self.step.errors else self.cuts(1).steps
-        most = most_windows(physics, steps, quick)
+        most = CUTTING.most(physics, steps, quick)
         return self.step.noisier(self.cuts(self.step.factor, limit=most, centred=False, late=self.gate.timing.moved))
 
 
@@ -152,6 +152,7 @@ def prepare(
     timed = _timed(checked, size, allows(noise.noise_of_positions(usable)).limit, request.group, budget)
     physics = physics_of(timed.robot, checked.dt, stack)
     cut = timed.cut(physics, request.quick)
+    simulator = Simulator(physics, cut)
     base = candidates.base_coordinates(timed.robot.space, timed.robot.accuracy, timed.robot.assumed)
     led = inverse_dynamics_check.lead(candidates.enumerate_candidates(physics), checked.look)
     allowed = allows(cut.sigma_q)
@@ -174,7 +175,7 @@ def prepare(
         robot=timed.robot,
         physics=physics,
         gate=timed.gate,
-        fitter=Fitter(Simulator(physics, cut), base, physics.space.nominal),
+        fitter=Fitter(simulator, base, physics.space.nominal),
         candidates=led.candidates,
         scales=size,
         settings=dataclasses.replace(settings, believed=timed.step.believed, budget=budget),
@@ -192,7 +193,9 @@ def _checked(robot: Robot, logs: Sequence[Log], request: Request, looked: Callab
     dt, said = control_period(robot, logs), [*request.notes]
     found, look = _looked_at(logs, robot, dt, looked)
     said += [look.note] if look.note else []
-    seconds = at_most(robot.mj_model.nv, request.quick) * (CUTTING.window + AROUND)  # that all windows hold together
+    seconds = CUTTING.at_most(robot.mj_model.nv, request.quick) * (
+        CUTTING.window + AROUND
+    )  # that all windows hold together
     beginnings, shorter = observation.shortened(found.demand(), seconds)
     whole, bases = observation.completed(beginnings, robot.mj_model)
     found = found.of_logs(whole)
@@ -208,7 +211,7 @@ def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | No
     left = (budget.seconds - budget.spent) / CUTTING.simulations  # s for one simulation of all windows
     steps = integrator_choice.choose(checked.robot, dt, usable, measured, left)
     cuts, step = steps.cuts, steps.worth
-    shift = _shift(cuts, step, size)
+    shift = command_shift.estimate(step, cuts, size.force)
     clocked = checked.gate if shift is None else checked.gate.moved(shift.lead)
     period, timestep = float(np.median([log.period for log in usable])), float(checked.robot.mj_model.opt.timestep)
     late = shift.notes(period) if shift is not None else []
@@ -234,23 +237,11 @@ def _measured(
     while True:
         cuts = windows_of(own, usable, group, use_qvel, seconds, first)
         steps = cuts(1).steps
-        fine = finest(own, len(cuts(1)), steps)
+        fine = CUTTING.finest(own, len(cuts(1)), steps)
         step = discretisation.measure(own, cuts, usable, fine, first=first, limit=limit)
         if not (contacts(own) and step.lottery) or steps == RULES.parts:
             return cuts, step
         seconds /= 2
-
-
-def _shift(
-    cuts: Callable[..., Windows], step: discretisation.Discretisation, size: scales.Scales
-) -> command_shift.Shift | None:
-    """By how much commands act later or earlier than the logs say."""
-    if step.errors is None or not step.errors.physics.mj_model.nu:
-        return None
-    factor = min(step.factor, step.errors.finest)
-    return command_shift.estimate(
-        step.errors, lambda late: cuts(factor, late=round(late, 9)), step.floor, size.force, factor
-    )
 
 
 def _looked_at(logs: Sequence[Log], robot: Robot, dt: float, say: Callable[[Look], None]) -> tuple[gate.Gate, Look]:

@@ -97,3 +97,39 @@ def _direction(model: Any, body: int, read: dict[str, np.ndarray], label: str) -
         if np.linalg.norm(candidate) > 1e-9:
             return candidate / np.linalg.norm(candidate)
     raise UserError(f"{label}: the body has neither a long geom nor an offset that would give it a direction")
+
+
+# Reach of a load beyond its body's centre of mass, the scale of an unknown payload's place: of the body's own size, of
+# the robot's length. Rules of thumb, not measured.
+BESIDE, OUT = 1.2, 0.3
+
+
+def tree_mass(model: mujoco.MjModel, body: int) -> float:
+    """kg of all that moves in the body's tree."""
+    own = (model.body_rootid == model.body_rootid[body]) & (model.body_weldid != 0)
+    return float(model.body_mass[own].sum())
+
+
+def reach(model: mujoco.MjModel, body: int) -> float:
+    """m from the body's centre of mass to that of what it may carry: beyond the body itself, a tool's length."""
+    return max(BESIDE * body_size(model, body), OUT * _longest_chain(model, body))
+
+
+def _longest_chain(model: mujoco.MjModel, body: int) -> float:
+    """m, the longest chain of the body's tree, stretched out."""
+    length = np.zeros(model.nbody)
+    for b in range(1, model.nbody):
+        above = int(model.body_parentid[b])
+        length[b] = length[above] + (np.linalg.norm(model.body_pos[b]) if above else 0.0)
+    own = np.flatnonzero(model.body_rootid == model.body_rootid[body])
+    return max((float(length[b]) + body_size(model, int(b)) for b in own if b), default=0.0)
+
+
+def body_size(model: mujoco.MjModel, body: int) -> float:
+    """m from the body's centre of mass to the farthest end of its geoms, or where a body joins."""
+    centre = model.body_ipos[body]
+    own = np.flatnonzero((model.geom_bodyid == body) & (model.geom_type != int(mujoco.mjtGeom.mjGEOM_PLANE)))
+    ends = [np.linalg.norm(model.geom_pos[g] - centre) + model.geom_rbound[g] for g in own]
+    joined = np.flatnonzero(model.body_parentid == body)
+    ends += [np.linalg.norm(model.body_pos[b] - centre) for b in joined if b != body]
+    return max([float(r) for r in ends], default=0.0) or 0.1

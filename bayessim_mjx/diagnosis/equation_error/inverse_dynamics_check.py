@@ -123,9 +123,9 @@ def check(
     sums = summing.gather(logs, model)
     if not sums.used.any():
         return Look(seconds=time.monotonic() - began)
-    known = terms.known(model, sums.layout, accuracy or {}, sums.period)
     places = [log.qpos for log in summing.shortened(logs)]
     carried = drives.carried(model, np.concatenate(places), rating)
+    known = terms.known(model, sums.layout, accuracy or {}, sums.period)
     offered = terms.effects(model, sums.layout, sums.source, carried, controllers.of_logs(logs, model))
     stated = all(str(log.metadata.get("effort_unit", "")) in UNITS for log in logs)
     own = OfModel(logs, model)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
-from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Mask, Motion, Regressor, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Mask, Regressor, motion
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.support.actuators import OfGains
 from bayessim_mjx.logs.log import Log
@@ -20,7 +20,6 @@ from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
 OWN = ("acceleration", "speed", "dry", "drag", "position", "one", "load", "effort_load")
-SHIFT = float(np.finfo(float).eps) ** (1 / 3)  # rad or m, of a central difference: rounding and curvature cost as much
 # multiples of a servo's gain at which its effort is computed; between them it is interpolated. A rule of thumb
 GAINS = (0.1, 0.32, 1.0, 3.2, 10.0)
 ROWS = 12000  # of all logs together, at their own rates: seconds, not errors; a choice, not counted
@@ -80,7 +79,8 @@ class Sums:
     """Products of the columns, each row counted as so many independent ones.
 
     Attributes:
-        gram: `[nv, P, P]`; rows: `[nv]`, independent rows; source: `[nv]`, where the effort comes from (`sources`).
+        gram: `[nv, P, P]`; rows: `[nv]`, independent rows.
+        source: `[nv]`, where the effort comes from (`drives.sources`).
         period: s between the logs' rows.
     """
 
@@ -107,34 +107,10 @@ class Sums:
         return np.sqrt(np.max([self.power(c) for c in (lay.at("effort"), lay.at("known"), lay.at("load"))], axis=0))
 
 
-def sources(log: Log, model: mujoco.MjModel) -> tuple[str, ...]:
-    """Per dof: `effort` as measured, `ctrl` as commanded, `none` where nothing drives it, `` where it is not known."""
-    dofs = [drives.dof_of(model, i) for i in range(model.nu)]
-    elsewhere = any(d is None for d in dofs)
-    out = []
-    for dof in range(model.nv):
-        own = [i for i, d in enumerate(dofs) if d == dof]
-        if not own:
-            out.append("" if elsewhere else "none")
-        elif all(drives.measured(log, i) is not None for i in own):
-            out.append("effort")
-        else:
-            out.append("ctrl" if all(_known(model, i) for i in own) else "")
-    return tuple(out)
-
-
-def _known(model: mujoco.MjModel, i: int) -> bool:
-    """Whether the actuator's force is a static law of command, position and speed."""
-    fixed = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
-    affine = int(model.actuator_biastype[i]) <= int(mujoco.mjtBias.mjBIAS_AFFINE)
-    return fixed and affine and int(model.actuator_dyntype[i]) == int(mujoco.mjtDyn.mjDYN_NONE)
-
-
-def layout_of(model: mujoco.MjModel, logs: Sequence[Log]) -> Layout:
-    """Return the columns of a model, and of the controllers that logs declare."""
+def layout_of(model: mujoco.MjModel, loops: Mapping[str, NDArray[np.bool_]]) -> Layout:
+    """Return the columns of a model, and of the controllers that logs declare (`drives.loops_of`)."""
     dofs = [drives.dof_of(model, i) for i in range(model.nu)]
     shared = tuple(i for i, dof in enumerate(dofs) if dof is not None and dofs.count(dof) > 1)
-    loops = drives.loops_of(model, logs)
     gains = [
         (kind.name, i)
         for kind in map(library.load, library.names())
@@ -151,17 +127,19 @@ def columns(
     """(all columns of one log `[T, nv, size]`, rows `[nv, T]` to be used, how many independent ones a row is).
 
     Args:
-        source: `[nv]`, see `sources`; slow: `[nv]`, speeds at which dry friction turns over.
+        source: `[nv]`, see `drives.sources`; slow: `[nv]`, speeds at which dry friction turns over.
     """
     moved = motion(log, model)
     found = Regressor.of(model, moved, slow)
     x = np.zeros((len(moved.time), model.nv, layout.size))
+    for v, column in rigid_body.by_zeros(model, moved.qpos, moved.qvel, moved.qacc).items():
+        x[:, :, layout.at("zero") + v] = moved.smooth(column)
     x[:, :, : layout.at(OWN[0])] = found.columns
     x[:, :, [layout.at("tilt"), layout.at("tilt") + 1]], x[:, :, layout.at("known")] = found.tilt, found.known
     of = {"effort": drives.measured_forces(log, model), "ctrl": drives.commanded(drives.centred(log), model)}
     each = {name: drives.on_dofs(force, model) for name, force in of.items()}
     effort = np.where(np.array(source) == "effort", each["effort"], each["ctrl"])
-    y = np.stack([filtered(effort[:, v], log, moved) for v in range(model.nv)], 1)
+    y = np.stack([moved.filtered(effort[:, v], log) for v in range(model.nv)], 1)
     for name, column in found.own.items():
         x[:, :, layout.at(name)] = column
     x[:, :, layout.at("effort_load")] = moved.smooth(np.abs(y) * found.dry)
@@ -169,14 +147,12 @@ def columns(
         dof = drives.dof_of(model, i)
         if dof is not None and source[dof] == "ctrl":  # a measured effort is what the servo gave, whatever its gains
             for g, more in enumerate(_by_gain(log, model, library.load(name), i, of["ctrl"][:, i]), len(GAINS) * k):
-                x[:, dof, layout.at("gain") + g] = filtered(model.actuator_gear[i, 0] * more, log, moved)
-    for v, column in _zeros(model, moved).items():
-        x[:, :, layout.at("zero") + v] = moved.smooth(column)
+                x[:, dof, layout.at("gain") + g] = moved.filtered(model.actuator_gear[i, 0] * more, log)
     x[:, :, layout.at("effort")], x[:, :, layout.at("late")] = y, np.gradient(y, moved.step, axis=0)
     for i in layout.shared:
         dof = drives.dof_of(model, i)
         if dof is not None and source[dof] in of:
-            x[:, dof, layout.drive(i)] = filtered(model.actuator_gear[i, 0] * of[source[dof]][:, i], log, moved)
+            x[:, dof, layout.drive(i)] = moved.filtered(model.actuator_gear[i, 0] * of[source[dof]][:, i], log)
     rows = np.stack([moved.moving(v) & (source[v] != "") for v in range(model.nv)])
     return x, rows, moved.share
 
@@ -188,7 +164,7 @@ def _by_gain(log: Log, model: mujoco.MjModel, kind: type[Effect], actuator: int,
     """
     log, law = drives.centred(log), controllers.read(log.metadata, model, log.actuators, log.name)
     for factor in GAINS:
-        factor = factor if factor != 1.0 else 1.0 + SHIFT
+        factor = factor if factor != 1.0 else 1.0 + rigid_body.SHIFT
         if issubclass(kind, OfGains):
             moved = drives.commanded(log, kind.scaled(model, actuator, factor))
         else:
@@ -197,24 +173,10 @@ def _by_gain(log: Log, model: mujoco.MjModel, kind: type[Effect], actuator: int,
         yield (moved[:, actuator] - force) / (factor - 1.0)
 
 
-def _zeros(model: mujoco.MjModel, moved: Motion) -> dict[int, Array]:
-    """{dof: `[T, nv]`}, derivative of the nominal effort by the zero of a hinge or slide."""
-    out = {}
-    for joint in np.flatnonzero(model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)):
-        ends = []
-        for sign in (1, -1):
-            qpos = moved.qpos.copy()
-            qpos[:, int(model.jnt_qposadr[joint])] += sign * SHIFT
-            ends.append(rigid_body.recursive(model, qpos, moved.qvel, moved.qacc))
-        out[int(model.jnt_dofadr[joint])] = (ends[0] - ends[1]) / (2 * SHIFT)
-    return out
-
-
 def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
     """Return the sums of logs that move; joints whose effort is not known in all of them are left out."""
-    each = [sources(log, model) for log in logs]
-    source = tuple(_common(s) for s in zip(*each, strict=True))
-    layout = layout_of(model, logs)
+    source, loops = drives.sources(logs, model), drives.loops_of(model, logs)
+    layout = layout_of(model, loops)
     short = shortened(logs)
     top = np.max([np.percentile(np.abs(log.qvel), 95, axis=0) for log in short], axis=0)
     gram, rows = np.zeros((model.nv, layout.size, layout.size)), np.zeros(model.nv)
@@ -225,13 +187,6 @@ def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
             gram[v] += share * own.T @ own
             rows[v] += share * len(own)
     return Sums(layout, gram, rows, source, float(np.median([log.period for log in logs])))
-
-
-def _common(each: Sequence[str]) -> str:
-    """Return the source that all logs have."""
-    if len(set(each)) == 1:
-        return each[0]
-    return "ctrl" if set(each) == {"ctrl", "effort"} else ""
 
 
 def shortened(logs: Sequence[Log]) -> list[Log]:

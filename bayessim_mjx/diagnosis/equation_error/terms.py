@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY
 from bayessim_mjx.diagnosis.equation_error.fit import LEAST, Term
-from bayessim_mjx.diagnosis.equation_error.sums import GAINS, SHIFT, Layout
-from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
+from bayessim_mjx.diagnosis.equation_error.sums import GAINS, Layout
+from bayessim_mjx.diagnosis.logcheck import rigid_body
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of
+from bayessim_mjx.diagnosis.logcheck.rigid_body import SHIFT
 from bayessim_mjx.effects.support.actuators import OfGains
 from bayessim_mjx.effects.support.site import element_names
+from bayessim_mjx.parameters import geometry
 from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
@@ -170,7 +172,7 @@ def payloads(model: mujoco.MjModel, layout: Layout, carried: Array) -> list[Term
         bare = model.body_weldid[body] != body and model.body_mass[body] <= 0
         if carried[body] <= 0 or bare:
             continue
-        reach = drives.reach(model, body)
+        reach = geometry.reach(model, body)
         most = float(carried[body])
         shape = _load(layout, base, centre, turn)
         low, high = np.array([0.0, *(3 * [-np.inf])]), np.array([most, *(3 * [np.inf])])
@@ -193,7 +195,7 @@ def links(model: mujoco.MjModel, layout: Layout) -> list[Term]:
             ends = [rigid_body.inertial(mass, centre + sign * axis, none) for sign in (1, -1)]
             shape[:, own, k] = (ends[0] - ends[1]) / 2  # exact: it is quadratic
         shape[:, own, 3] = rigid_body.inertial(0.0, centre, axes @ np.diag(model.body_inertia[body]) @ axes.T)
-        sd = np.array([*(q.deviation * drives.size(model, body) for q in places), inertia.deviation])
+        sd = np.array([*(q.deviation * geometry.body_size(model, body) for q in places), inertia.deviation])
         name = element_names(model, "body")[body]
         out.append(_term("inertial_parameters", name, shape, _link, sd=sd))
     return out

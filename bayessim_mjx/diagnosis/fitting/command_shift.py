@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.data_sheet import WORST
 from bayessim_mjx.diagnosis.fitting.candidates import STEP
+from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
 from bayessim_mjx.diagnosis.fitting.substep_errors import Case, Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
@@ -84,17 +85,19 @@ class Shift:
         return f"{text}{smooth} (`commands_late: {self.late:.4g}` beside the logs does the same)"
 
 
-def estimate(errors: Errors, late: Shifted, sigma: Array, force: Array, factor: int) -> Shift | None:
-    """Return the shift of all commands together; None: the fit finds no end.
+def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -> Shift | None:
+    """Return the shift of all commands together; None: there are none, or the fit finds no end.
 
     Args:
-        errors: with its start states fitted.
-        late: windows with shifted commands, at the sub-steps of `factor`.
-        sigma: `[2 nv]`, noise; infinite where nothing was measured.
+        step: its errors with their start states fitted; its noise is infinite where nothing was measured.
+        cuts: (factor on the sub-steps, late=s) -> windows.
         force: `[nv]`, typical size of what acts on each joint.
-        factor: sub-steps per timestep of the model, at most `errors.finest`.
     """
-    cut, model = errors.cut, _Model(errors, late, sigma, force, factor)
+    errors, sigma = step.errors, step.floor
+    if errors is None or not errors.physics.mj_model.nu:
+        return None
+    factor = min(step.factor, errors.finest)
+    cut, model = errors.cut, _Model(errors, lambda s: cuts(factor, late=round(s, 9)), sigma, force, factor)
     precision = np.full(model.size, WORST**-2)
     x, starts = np.zeros(model.size), np.zeros_like(errors.offsets)
     r = model.residual(x, starts)
@@ -104,8 +107,8 @@ def estimate(errors: Errors, late: Shifted, sigma: Array, force: Array, factor: 
     while gained > len(cut) and abs(x[0]) < 1:  # a squared noise a window; by derivatives at the beginning
         q, found = eliminate(r, A, B, errors.offsets + starts, cut.spread)
         g, S = q.weighted(np.ones(len(cut)))
-        step = share * np.asarray(np.linalg.solve(S + np.diag(precision), g - precision * x), np.float64)
-        moved = x + step, starts + share * found.step(A, step / share)
+        change = share * np.asarray(np.linalg.solve(S + np.diag(precision), g - precision * x), np.float64)
+        moved = x + change, starts + share * found.step(A, change / share)
         there = model.residual(*moved)
         gained = float(np.sum(r**2) - np.sum(there**2))
         if gained > 0:

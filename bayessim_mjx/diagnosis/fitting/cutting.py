@@ -39,6 +39,23 @@ class Cutting:
         """s, control period, of which the fewest windows take the whole budget; faster logs are resampled."""
         return self.window * self.fewest / self.budget
 
+    def at_most(self, nv: int, quick: bool = False) -> int:
+        """Windows of a robot of so many degrees of freedom, whatever its time step."""
+        return self.fewest if quick else next(n for dofs, n in self.limits if nv <= dofs)
+
+    def most(self, physics: Physics, length: int, quick: bool = False) -> int:
+        """Most windows of so many control steps that are simulated at once."""
+        afforded = max(self.fewest, self._budget(physics) // (length * physics.substeps))
+        return min(self.at_most(physics.mj_model.nv, quick), afforded)
+
+    def finest(self, physics: Physics, count: int, length: int) -> int:
+        """How many times the sub-steps the budget allows when at most half of `count` windows are given up for it."""
+        return max(1, self._budget(physics) // (length * physics.substeps * max(self.fewest, (count + 1) // 2)))
+
+    def _budget(self, physics: Physics) -> int:
+        """Sub-steps of one simulation of all windows."""
+        return self.budget if physics.mj_model.nv <= self.many else self.budget // 2
+
 
 CUTTING = Cutting()
 
@@ -64,7 +81,8 @@ def windows_of(
     length = max(round(seconds / dt), RULES.parts)
     if longest < length:
         raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
-    own = max(min(CUTTING.fewest, most_windows(physics, length)), most_windows(physics, length) // first)
+    most = CUTTING.most(physics, length)
+    own = max(min(CUTTING.fewest, most), most // first)
 
     @functools.cache
     def cuts(factor: int, limit: int = own, centred: bool = True, late: float = 0.0) -> windows.Windows:
@@ -85,25 +103,3 @@ def windows_of(
             f"{len(cuts(1))} windows of {length * dt:.2g} s; holding conditions out needs {CUTTING.least}"
         )
     return cuts
-
-
-def most_windows(physics: Physics, length: int, quick: bool = False) -> int:
-    """Most windows of so many control steps that are simulated at once."""
-    return min(
-        at_most(physics.mj_model.nv, quick), max(CUTTING.fewest, _budget(physics) // (length * physics.substeps))
-    )
-
-
-def _budget(physics: Physics) -> int:
-    """Sub-steps of one simulation of all windows."""
-    return CUTTING.budget if physics.mj_model.nv <= CUTTING.many else CUTTING.budget // 2
-
-
-def at_most(nv: int, quick: bool = False) -> int:
-    """Windows of a robot of so many degrees of freedom, whatever its time step."""
-    return CUTTING.fewest if quick else next(n for dofs, n in CUTTING.limits if nv <= dofs)
-
-
-def finest(physics: Physics, count: int, length: int) -> int:
-    """How many times the sub-steps the budget allows when at most half of `count` windows are given up for it."""
-    return max(1, _budget(physics) // (length * physics.substeps * max(CUTTING.fewest, (count + 1) // 2)))

@@ -181,7 +181,7 @@ def measure(
     """
     start, factors = cuts(first), [first * f for f in FACTORS]
     touching = contacts(physics)
-    sigma = np.concatenate([start.sigma_q, start.sigma_v])
+    sigma, clean = np.concatenate([start.sigma_q, start.sigma_v]), simulated(physics.mj_model, logs)
     errors = Errors(physics, start, factors[-1])
     errors.start(sigma)
     coarse, mid, fine = (errors.run(cuts(f), f) for f in factors)
@@ -193,7 +193,6 @@ def measure(
     worth = _size(one, touching) * _all(gain, touching)
     at = {f: worth / gain**k for k, f in enumerate(factors)}
     settled = _size(settle(plain - truth), touching)
-    clean = simulated(physics.mj_model, logs)
     base = np.hypot(sigma, np.tile(clean, 2) * settled)  # who simulated such logs may have used this step or another
     factor = _choose({f: float(np.max(at[f] / base)) for f in factors if f <= max(first, most)})
     return Discretisation(

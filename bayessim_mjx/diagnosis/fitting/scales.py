@@ -15,7 +15,7 @@ from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.site import element_names, floating
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
-from bayessim_mjx.parameters import Parameter
+from bayessim_mjx.parameters import Parameter, geometry
 
 Array = NDArray[np.float64]
 
@@ -69,9 +69,9 @@ class Scales:
             below = float(model.body_subtreemass[i])
             mass = max(float(model.body_mass[i]), 0.1 * below)
             load = max(LIMITS.load * mass, float(self.carried[i]))
-            own = {"mass": mass, "weight": below * gravity, "size": drives.size(model, i)}
+            own = {"mass": mass, "weight": below * gravity, "size": geometry.body_size(model, i)}
             own |= self._of_floating(int(model.body_dofadr[i])) if floating(model, i) else {}
-            return own | {"carried": load, "tool": drives.reach(model, i)}
+            return own | {"carried": load, "tool": geometry.reach(model, i)}
         return {"moment": _moment(model)}
 
     def _of_floating(self, v: int) -> dict[str, float]:

@@ -131,9 +131,13 @@ def cut(
         )
     blocks = len(names) == 1  # one condition only: blocks in time are held out
     names, group_of_window = _blocks(starts, even) if blocks else (names, [group_of[r] for r, _ in starts])
+    batch, notes = (
+        _batch(even, fine, starts, length, dt, model, controllers.of_logs(logs, model)),
+        group_notes(logs, group),
+    )
     sigma_q, sigma_v, spread = noise_of(even, logs, use_qvel and all(log.has_qvel for log in logs))
     return Windows(
-        batch=_batch(even, fine, starts, length, dt, model, controllers.of_logs(logs, model)),
+        batch=batch,
         log=np.asarray([r for r, _ in starts]),
         start=np.asarray([a for _, a in starts]),
         group=np.asarray(group_of_window),
@@ -144,7 +148,7 @@ def cut(
         logs=tuple(even),
         dt=dt,
         periods=tuple(log.period for log in logs),
-        notes=group_notes(logs, group),
+        notes=notes,
         blocks=blocks,
     )
 

@@ -9,11 +9,9 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.logs.log import Array, Log
+from bayessim_mjx.parameters.geometry import tree_mass
 from bayessim_mjx.physics import controllers
 
-# Reach of a load beyond its body's centre of mass, the scale of an unknown payload's place: of the body's own size, of
-# the robot's length. Rules of thumb, not measured.
-BESIDE, OUT = 1.2, 0.3
 # Of a joint's root mean square effort: so much filters and derivatives are worth. A choice, not counted.
 FLOOR = 0.01
 # Share that counts as nothing, three of these standard deviations: of an effort, rms (an effect, a constant, what is
@@ -165,7 +163,7 @@ def carried(model: mujoco.MjModel, places: Array, rating: Mapping[int, float] | 
         places: `[T, nq]`, positions that were logged; rating: {body: kg}, of a data sheet.
     """
     limit = force_limits(model)
-    out = np.array([weight(model, b) for b in range(model.nbody)])
+    out = np.array([tree_mass(model, b) for b in range(model.nbody)])
     data, jacobian = mujoco.MjData(model), np.zeros((3, model.nv))
     for qpos in places if np.isfinite(limit).any() else ():
         data.qpos[:] = qpos
@@ -206,32 +204,29 @@ def _largest(model: mujoco.MjModel, actuator: int) -> float:
     return min(ends, default=np.inf)
 
 
-def weight(model: mujoco.MjModel, body: int) -> float:
-    """kg of all that moves in the body's tree."""
-    own = (model.body_rootid == model.body_rootid[body]) & (model.body_weldid != 0)
-    return float(model.body_mass[own].sum())
+def sources(logs: Sequence[Log], model: mujoco.MjModel) -> tuple[str, ...]:
+    """Per dof, in all logs: `effort` as measured, `ctrl` as commanded, `none`: nothing drives it, ``: not known."""
+    each = [set(of) for of in zip(*(_sources(log, model) for log in logs), strict=True)]
+    return tuple(of.pop() if len(of) == 1 else "ctrl" if of == {"ctrl", "effort"} else "" for of in each)
 
 
-def reach(model: mujoco.MjModel, body: int) -> float:
-    """m from the body's centre of mass to that of what it may carry: beyond the body itself, a tool's length."""
-    return max(BESIDE * size(model, body), OUT * _length(model, body))
+def _sources(log: Log, model: mujoco.MjModel) -> list[str]:
+    dofs = [dof_of(model, i) for i in range(model.nu)]
+    elsewhere = any(d is None for d in dofs)
+    out = []
+    for dof in range(model.nv):
+        own = [i for i, d in enumerate(dofs) if d == dof]
+        if not own:
+            out.append("" if elsewhere else "none")
+        elif all(measured(log, i) is not None for i in own):
+            out.append("effort")
+        else:
+            out.append("ctrl" if all(_static(model, i) for i in own) else "")
+    return out
 
 
-def _length(model: mujoco.MjModel, body: int) -> float:
-    """m, the longest chain of the body's tree, stretched out."""
-    length = np.zeros(model.nbody)
-    for b in range(1, model.nbody):
-        above = int(model.body_parentid[b])
-        length[b] = length[above] + (np.linalg.norm(model.body_pos[b]) if above else 0.0)
-    own = np.flatnonzero(model.body_rootid == model.body_rootid[body])
-    return max((float(length[b]) + size(model, int(b)) for b in own if b), default=0.0)
-
-
-def size(model: mujoco.MjModel, body: int) -> float:
-    """m from the body's centre of mass to the farthest end of its geoms, or where a body joins."""
-    centre = model.body_ipos[body]
-    own = np.flatnonzero((model.geom_bodyid == body) & (model.geom_type != int(mujoco.mjtGeom.mjGEOM_PLANE)))
-    ends = [np.linalg.norm(model.geom_pos[g] - centre) + model.geom_rbound[g] for g in own]
-    joined = np.flatnonzero(model.body_parentid == body)
-    ends += [np.linalg.norm(model.body_pos[b] - centre) for b in joined if b != body]
-    return max([float(r) for r in ends], default=0.0) or 0.1
+def _static(model: mujoco.MjModel, i: int) -> bool:
+    """Whether the actuator's force is a static law of command, position and speed."""
+    fixed = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+    affine = int(model.actuator_biastype[i]) <= int(mujoco.mjtBias.mjBIAS_AFFINE)
+    return fixed and affine and int(model.actuator_dyntype[i]) == int(mujoco.mjtDyn.mjDYN_NONE)

@@ -11,14 +11,15 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.logcheck.drives import LEAST, Effort, efforts, reach, weight
-from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, LOOSE, Bounded, Mask, Regressor, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.drives import LEAST, Effort
+from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, LOOSE, Bounded, Mask, Regressor, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial, moving_bodies, nominal
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding
 from bayessim_mjx.diagnosis.logcheck.timing import LAGS, Late, nearest
 from bayessim_mjx.effects.gravity_tilt import GravityTilt
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import bandwidth
+from bayessim_mjx.parameters.geometry import reach, tree_mass
 from bayessim_mjx.quantities import percent
 
 # Of an effort's variance: a log is refused where more is unexplained than explained, and doubted below the second. One
@@ -57,9 +58,8 @@ class Relation:
         return self.explained is not None and self.explained < HALF
 
 
-def relations(log: Log, mj_model: mujoco.MjModel) -> list[Relation]:
-    """One relation per joint and source of effort."""
-    found = list(efforts(log, mj_model))
+def relations(log: Log, mj_model: mujoco.MjModel, found: Sequence[Effort]) -> list[Relation]:
+    """One relation per joint and source of effort (`drives.efforts`)."""
     if not found:
         return []
     top = bandwidth(log)
@@ -184,7 +184,7 @@ class _Test:
 
     @property
     def signal(self) -> Array:
-        return filtered(self.effort.signal, self.log, self.picture.own.moved)
+        return self.picture.own.moved.filtered(self.effort.signal, self.log)
 
     @property
     def cutoff(self) -> float:
@@ -205,7 +205,7 @@ class _Test:
 
     def over(self, lags: Array) -> Array:
         """[L] share explained where the effort is delayed by each lag."""
-        signals = filtered(self.effort.signal, self.log, self.picture.own.moved, lags)
+        signals = self.picture.own.moved.filtered(self.effort.signal, self.log, lags)
         return self.model.explained(signals, self.rows, self.effort.scaled)
 
     def share(self, rows: Mask | None = None, sign: float = 1.0, scaled: bool | None = None) -> float:
@@ -257,4 +257,4 @@ def _at_the_ends(model: mujoco.MjModel) -> Iterator[tuple[int, Array, float]]:
     above = {int(model.body_weldid[model.body_parentid[b]]) for b in jointed}
     for body in (int(b) for b in jointed if int(b) not in above):
         for side in np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]):
-            yield body, model.body_ipos[body] + reach(model, body) * side, weight(model, body)
+            yield body, model.body_ipos[body] + reach(model, body) * side, tree_mass(model, body)

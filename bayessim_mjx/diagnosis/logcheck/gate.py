@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
 from bayessim_mjx.diagnosis.logcheck import effort, single_log
-from bayessim_mjx.diagnosis.logcheck.drives import dof_of, is_effort, looped
+from bayessim_mjx.diagnosis.logcheck.drives import dof_of, efforts, is_effort, looped
 from bayessim_mjx.diagnosis.logcheck.effort import Relation
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding
-from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing, pooled
+from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import Velocity, agreeing, velocities
@@ -36,6 +36,11 @@ class Report:
     @property
     def usable(self) -> bool:
         return not self.of("refused")
+
+    @property
+    def first(self) -> list[Relation]:
+        """One relation of each joint that was tested: a stream of efforts comes before the command."""
+        return [*{r.joint: r for r in reversed(self.relations) if r.explained is not None}.values()]
 
     def of(self, kind: str) -> tuple[str, ...]:
         """Return the texts of one kind: refused, warning or finding."""
@@ -133,14 +138,9 @@ def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
     reports = tuple(_report(log, mj_model, dt) for log in logs)
     usable = [r for r in reports if r.usable]
     seen = [v for r in usable for v in r.velocities]
-    first = [(e.joint, e.late) for r in usable for e in _first(r.relations)]
+    first = [(e.joint, e.late) for r in usable for e in r.first]
     timing = Timing(pooled((v.channel, Late(v.lag)) for v in seen), pooled(first))
     return Gate(reports, agreeing(seen, max([dt, *(r.log.period for r in usable)])), timing)
-
-
-def _first(related: Sequence[Relation]) -> list[Relation]:
-    """One relation of each joint that was tested: a stream of efforts comes before the command."""
-    return [*{r.joint: r for r in reversed(related) if r.explained is not None}.values()]
 
 
 def unusable(log: Log, dt: float) -> bool:
@@ -156,13 +156,15 @@ def _report(log: Log, mj_model: mujoco.MjModel, dt: float) -> Report:
     own = _alone(log, dt)
     if any(f.kind == "refused" for f in own):
         return Report(log, own)  # nothing further can be computed from it
-    related = () if log.lost else tuple(effort.relations(log, mj_model))  # forces on a joint need the motion of all
+    found = () if log.lost else tuple(efforts(log, mj_model))  # forces on a joint need the motion of all
+    related = tuple(effort.relations(log, mj_model, found))
+    unrelated = effort.remarks(related)
     seen = tuple(velocities(log))
-    step = max(dt, log.period)
+    behind = [Finding("warning", v.sentence()) for v in seen if not v.usable(max(dt, log.period))]
     targets = _targets(log, mj_model)
-    behind = [Finding("warning", v.sentence()) for v in seen if not v.usable(step)]
-    own += (*single_log.clipped(log, targets), *single_log.units(log, _vouched(log, mj_model, related, targets)))
-    return Report(log, (*own, *behind, *effort.remarks(related)), related, seen)
+    vouched = _vouched(log, mj_model, related, targets)
+    own += (*single_log.clipped(log, targets), *single_log.units(log, vouched))
+    return Report(log, (*own, *behind, *unrelated), related, seen)
 
 
 def _targets(log: Log, mj_model: mujoco.MjModel) -> dict[str, Array]:
@@ -189,3 +191,16 @@ def _vouched(log: Log, mj_model: mujoco.MjModel, related: Sequence[Relation], ta
         if moved > 0 and np.ptp(q) > 0 and abs(np.log(np.ptp(q) / moved)) < 0.5 * np.log(np.degrees(1.0)):
             found.add(joint)
     return found
+
+
+def pooled(each: Iterable[tuple[str, Late]]) -> dict[str, Late]:
+    """{name: median over logs}; its error is the median of those that are known over the root of their number."""
+    of: dict[str, list[Late]] = {}
+    for name, late in each:
+        of.setdefault(name, []).append(late)
+    out = {}
+    for name, own in of.items():
+        known = [x.error for x in own if np.isfinite(x.error)]
+        error = float(np.median(known)) / len(known) ** 0.5 if known else float("nan")
+        out[name] = Late(float(np.median([x.seconds for x in own])), error)
+    return out

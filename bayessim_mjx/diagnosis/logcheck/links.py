@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.diagnosis.logcheck.drives import FLOOR, LEAST, centred, commanded, controlled, efforts, measured
-from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Mask, Regressor, filtered, motion
+from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Mask, Regressor, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import nominal
 from bayessim_mjx.diagnosis.logcheck.timing import LAGS, SURE, Timing, nearest
 from bayessim_mjx.logs.log import Array, Log
@@ -129,6 +129,12 @@ class Channel:
         sure = LEAST * self.size + SURE * self.doubt
         return self.constant if abs(self.constant) > sure and self.identified and not self.echo else 0.0
 
+    def judged(self, common: float, period: float) -> Channel:
+        """Return the channel in units of the `common` scale, with whether it is sound."""
+        c = replace(self, scale=self.scale / common, deviation=self.deviation / abs(common))
+        obeys = c.apart < LEAST + 2.0 * c.noise + FLOOR * (c.cancels - 1.0) and abs(c.late) < period
+        return replace(c, sound=bool(obeys and c.off == 1.0 and c.shifted == 0.0))
+
 
 def channels_of(
     logs: Sequence[Log], model: mujoco.MjModel, unit: bool, ask: Callable[[Log, mujoco.MjModel], Array] = commanded
@@ -148,13 +154,7 @@ def channels_of(
     period = float(np.median([log.period for log in logs]))
     found = [_better(logs[0].actuators[i], [p[k] for p in pairs], period) for k, i in enumerate(own)]
     common = 1.0 if unit else float(np.median([c.scale for c in found])) or 1.0
-    return tuple(_judged(c, common, period) for c in found)
-
-
-def _judged(c: Channel, common: float, period: float) -> Channel:
-    c = replace(c, scale=c.scale / common, deviation=c.deviation / abs(common))
-    obeys = c.apart < LEAST + 2.0 * c.noise + FLOOR * (c.cancels - 1.0) and abs(c.late) < period
-    return replace(c, sound=bool(obeys and c.off == 1.0 and c.shifted == 0.0))
+    return tuple(c.judged(common, period) for c in found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,8 +190,8 @@ def _pairs(
     for i in own:
         effort = measured(log, i)
         assert effort is not None
-        at = [filtered(x[:, i], log, moved, LAGS)[:, moved.free] for x in (held, middle)]
-        rows = [filtered(x, log, moved)[moved.free] for x in (effort, noise[:, i], slow[:, i])]
+        at = [moved.filtered(x[:, i], log, LAGS)[:, moved.free] for x in (held, middle)]
+        rows = [moved.filtered(x, log)[moved.free] for x in (effort, noise[:, i], slow[:, i])]
         out.append(_Pair(rows[0], at[0], at[1], rows[1], rows[2], np.stack([held[:, i], effort]), moved.share))
     return out
 
@@ -209,7 +209,7 @@ def _channel(name: str, pairs: Sequence[_Pair], commands: Sequence[Array], behin
     Args:
         behind: s that a command acts later on average than it stands in the log, which is no lateness.
     """
-    one = np.concatenate([np.full(len(p.effort), np.sqrt(p.share)) for p in pairs])
+    one, echo = np.concatenate([np.full(len(p.effort), np.sqrt(p.share)) for p in pairs]), _echo(pairs)
     rows = max(float(one @ one), 1e-9)
     y = one * np.concatenate([p.effort for p in pairs])
     each = one * np.concatenate(list(commands), axis=1)
@@ -229,7 +229,7 @@ def _channel(name: str, pairs: Sequence[_Pair], commands: Sequence[Array], behin
     late = lag - behind
     net = np.std(np.concatenate([p.centred[len(LAGS) // 2] for p in pairs]))
     cancels = max(1.0, float(np.std(np.concatenate([p.still for p in pairs])) / max(net, 1e-300)))
-    return Channel(name, scale, errors[0], late, left, peak, constant, errors[1], size, noise, cancels, _echo(pairs))
+    return Channel(name, scale, errors[0], late, left, peak, constant, errors[1], size, noise, cancels, echo)
 
 
 def _echo(pairs: Sequence[_Pair]) -> bool:
@@ -272,7 +272,7 @@ def _drives(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link
     for effort in found.values():
         name = "command -> motion" if effort.source == "ctrl" else "effort -> motion"
         rows = moved.moving(effort.dof)
-        signal = filtered(effort.signal, log, moved)
+        signal = moved.filtered(effort.signal, log)
         if rows.sum() * moved.share < FEWEST or np.ptp(signal[rows]) == 0:
             yield _untested(name, effort.joint, "too little motion free of contacts and limits")
             continue

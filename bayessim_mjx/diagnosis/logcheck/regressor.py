@@ -57,6 +57,13 @@ class Motion:
         """x `[T, ...]` on this grid, filtered as efforts are."""
         return lowpass(x, self.step, self.cutoff)
 
+    def filtered(self, signal: Array, log: Log, lags: Array | None = None) -> Array:
+        """Signal [T of the log] filtered alike, on this grid; [L, T] delayed by each of `lags` [L] s."""
+        grid, (even,) = _even(log, (signal[:, None],))
+        smooth = lowpass(even[:, 0], float(grid[1] - grid[0]), self.cutoff)
+        times = self.time if lags is None else self.time - lags[:, None]
+        return np.interp(times, grid, smooth)
+
     def moving(self, dof: int) -> Mask:
         """[T]: free, and faster than a twentieth of the top speed of this degree of freedom."""
         speed = np.abs(self.qvel[:, dof])
@@ -100,14 +107,6 @@ def _constrained(mj_model: mujoco.MjModel, qpos: Array) -> Mask:
         mujoco.mj_fwdPosition(mj_model, data)
         out[k] = data.ncon + data.ne + data.nl > 0
     return out
-
-
-def filtered(signal: Array, log: Log, moved: Motion, lags: Array | None = None) -> Array:
-    """signal [T of the log] filtered as the motion is, on the motion's grid; [L, T] delayed by each of `lags` [L] s."""
-    grid, (even,) = _even(log, (signal[:, None],))
-    smooth = lowpass(even[:, 0], float(grid[1] - grid[0]), moved.cutoff)
-    times = moved.time if lags is None else moved.time - lags[:, None]
-    return np.interp(times, grid, smooth)
 
 
 @dataclass(frozen=True, eq=False)

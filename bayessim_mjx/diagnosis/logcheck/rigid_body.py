@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+SHIFT = float(np.finfo(float).eps) ** (1 / 3)  # rad or m, of a central difference: rounding and curvature cost as much
 INERTIAL = 1 + 3 + len(_PAIRS)  # parameters of a body: mass, first moments and inertia
 
 
@@ -194,4 +195,17 @@ def recursive(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> A
         if model.ngravcomp:
             mujoco.mj_passive(model, data)
             row -= data.qfrc_gravcomp
+    return out
+
+
+def by_zeros(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> dict[int, Array]:
+    """{dof: `[T, nv]`}, derivative of `Rigid.nominal` by the zero of a hinge or slide."""
+    out = {}
+    for joint in np.flatnonzero(model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)):
+        ends = []
+        for sign in (1, -1):
+            there = qpos.copy()
+            there[:, int(model.jnt_qposadr[joint])] += sign * SHIFT
+            ends.append(recursive(model, there, qvel, qacc))
+        out[int(model.jnt_dofadr[joint])] = (ends[0] - ends[1]) / (2 * SHIFT)
     return out

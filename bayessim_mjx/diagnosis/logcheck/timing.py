@@ -15,7 +15,7 @@ Each lateness has one estimator, since each is another quantity:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -59,19 +59,6 @@ class Timing:
     velocities: Mapping[str, Late] = field(default_factory=dict)
     motion: Mapping[str, Late] = field(default_factory=dict)
     moved: float = 0.0
-
-
-def pooled(each: Iterable[tuple[str, Late]]) -> dict[str, Late]:
-    """{name: median over logs}; its error is the median of those that are known over the root of their number."""
-    of: dict[str, list[Late]] = {}
-    for name, late in each:
-        of.setdefault(name, []).append(late)
-    out = {}
-    for name, own in of.items():
-        known = [x.error for x in own if np.isfinite(x.error)]
-        error = float(np.median(known)) / len(known) ** 0.5 if known else float("nan")
-        out[name] = Late(float(np.median([x.seconds for x in own])), error)
-    return out
 
 
 def nearest(lags: Array, explained: Array, allowed: NDArray[np.bool_], count: float) -> Late:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting import scales
-from bayessim_mjx.diagnosis.fitting.command_shift import Shift
+from bayessim_mjx.diagnosis.fitting.command_shift import Shift, estimate
 from bayessim_mjx.diagnosis.run import diagnose
-from bayessim_mjx.diagnosis.setup import _measured, _shift
+from bayessim_mjx.diagnosis.setup import _measured
 from bayessim_mjx.logs import Channels, Log, estimate_velocity, resample
 from tests.diagnosis.pendulums import ARMATURE, DAMPING, MASS, MODEL, PERIOD, STEP, nominal, recorded
 
@@ -23,7 +23,8 @@ def logged_late(logs):
 
 def estimated(robot, logs) -> Shift:
     size = scales.measure(robot.mj_model, [resample(log, PERIOD) for log in logs])
-    found = _shift(*_measured(robot.physics(PERIOD), logs, group=None, use_qvel=False, limit=None), size)
+    cuts, step = _measured(robot.physics(PERIOD), logs, group=None, use_qvel=False, limit=None)
+    found = estimate(step, cuts, size.force)
     assert found is not None
     return found
 

@@ -3,8 +3,8 @@
 import mujoco
 import pytest
 
-from bayessim_mjx.diagnosis.logcheck.gate import check
-from bayessim_mjx.diagnosis.logcheck.timing import Late, pooled
+from bayessim_mjx.diagnosis.logcheck.gate import check, pooled
+from bayessim_mjx.diagnosis.logcheck.timing import Late
 from tests.diagnosis.recordings import PENDULUM, record, sines
 
 PERIOD = 0.01  # s, for which each command holds
