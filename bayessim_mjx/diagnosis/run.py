@@ -23,7 +23,7 @@ from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
 from bayessim_mjx.diagnosis.fitting.journal import Journal, Remembering, digest
 from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, robot_of
 from bayessim_mjx.diagnosis.logcheck.links import links as links_of
-from bayessim_mjx.diagnosis.phrases import first_look
+from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.diagnosis.request import Effects, Request
 from bayessim_mjx.diagnosis.residual import black_boxes, frequency, where
 from bayessim_mjx.diagnosis.residual.black_boxes import Flexible, flexible
@@ -118,7 +118,7 @@ def investigate(
     """
     observer.progress("looking at the logs", 0, 1)
     time_left = budget.begun(request.minutes)
-    setup = prepare(robot, logs, request, time_left, lambda look: observer.early(first_look.lines(look)))
+    setup = prepare(robot, logs, request, time_left, lambda look: observer.early(notes.first_look(look)))
     setup = remembering(setup, request.remember)
     for text in setup.said:
         observer.progress(text, 0, 1)

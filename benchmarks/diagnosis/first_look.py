@@ -164,7 +164,7 @@ def published(data: Path) -> None:
 
     from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check
     from bayessim_mjx.diagnosis.fitting import robot
-    from bayessim_mjx.diagnosis.phrases import first_look
+    from bayessim_mjx.diagnosis.phrases import notes
     from bayessim_mjx.logs import read_logs
 
     for name, convert in (("EMPS", real_logs.convert_emps), ("XL330", real_logs.convert_xl330)):
@@ -174,7 +174,7 @@ def published(data: Path) -> None:
             logs = read_logs(str(Path(folder) / "logs"), rig.mj_model, None)
             began = time.process_time()
             seen = check(logs, rig.mj_model)
-            print(f"{name} ({time.process_time() - began:.1f} CPU s)", *first_look.lines(seen), sep="\n  ")
+            print(f"{name} ({time.process_time() - began:.1f} CPU s)", *notes.first_look(seen), sep="\n  ")
 
 
 def main() -> None:

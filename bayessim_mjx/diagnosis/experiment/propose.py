@@ -17,7 +17,7 @@ from bayessim_mjx.diagnosis.experiment.design import Scored, Scorer
 from bayessim_mjx.diagnosis.experiment.limits import Drives, Excitation, Limits, Room, limits_of, menu
 from bayessim_mjx.diagnosis.experiment.rehearsal import Played, Rehearsal
 from bayessim_mjx.diagnosis.findings import Findings
-from bayessim_mjx.diagnosis.phrases import experiment as phrases
+from bayessim_mjx.diagnosis.phrases import advice as phrases
 from bayessim_mjx.diagnosis.phrases.effects import all_of
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model, nats

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from bayessim_mjx.diagnosis.phrases import effects, residual
 from bayessim_mjx.diagnosis.phrases import effects as named
-from bayessim_mjx.diagnosis.phrases import parameters, residual
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
 from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
 from bayessim_mjx.quantities import MOST, extent, finite, listed, percent
@@ -85,7 +85,7 @@ def sentences(d: Diagnosis) -> list[str]:
     if basis.get("efforts"):
         texts.append(f"By the logged efforts alone, {basis['efforts']}.")
     texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
-    texts += parameters.remarks(d.parameters)
+    texts += effects.remarks(d.parameters)
     texts += [named.not_on_offer(basis["tried"])] if d.verdict == "unexplained" and basis.get("tried") else []
     return [text for text in [*texts, not_tried(basis.get("not_tried"))] if text]
 

@@ -13,7 +13,7 @@ from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Where
 from bayessim_mjx.diagnosis.phrases import effects as phrases
-from bayessim_mjx.diagnosis.phrases import first_look, residual
+from bayessim_mjx.diagnosis.phrases import notes, residual
 from bayessim_mjx.diagnosis.phrases.verdict import horizon_warning, sentences
 from bayessim_mjx.diagnosis.request import length_unit
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
@@ -100,7 +100,7 @@ def basis(found: Findings, verdict: Verdict) -> dict[str, Any]:
         "above_noise": state.above_noise(state.base),
         "probability": chance if weighed.answer else {},
         "flexible": residual.flexible_of(top, on) if top is not None else {},
-        "efforts": first_look.verdict(found.setup.look),
+        "efforts": notes.first_verdict(found.setup.look),
         "tried": sorted({e.name for e in found.setup.physics.effects}),
         "not_tried": not_tried(state),
     }
@@ -218,7 +218,7 @@ def details(found: Findings) -> dict[str, Any]:
             }
             for k in found.links
         ],
-        "before_simulation": {"lines": first_look.lines(found.setup.look)} | found.setup.look.to_dict(),
+        "before_simulation": {"lines": notes.first_look(found.setup.look)} | found.setup.look.to_dict(),
         "noise": [
             {"channel": n, "sigma": float(s)}
             for n, s in zip(Channels.of(found.setup.physics.mj_model).qvel, cut.sigma_q, strict=True)

@@ -20,7 +20,7 @@ from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting import journal
 from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, one_line
-from bayessim_mjx.diagnosis.phrases import first_look
+from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.diagnosis.result import Diagnosis, load, plain
 from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
@@ -111,7 +111,7 @@ def write_preliminary(path: Path, about: Mapping[str, Any], setup: Setup, state:
     Args:
         about: entries of the report's header; state: None before the first fit.
     """
-    found = {"verdict": None, "about": dict(about), "before_simulation": first_look.lines(setup.look)}
+    found = {"verdict": None, "about": dict(about), "before_simulation": notes.first_look(setup.look)}
     found |= {"warnings": list(setup.warnings)} | ({} if state is None else _so_far(state))
     path.parent.mkdir(parents=True, exist_ok=True)
     every = plain(found | {"windows": len(setup.fitter.simulator.windows)})

@@ -9,7 +9,7 @@ import rigs
 from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check, lead, proposed
 from bayessim_mjx.diagnosis.fitting import robot
 from bayessim_mjx.diagnosis.fitting.candidates import enumerate_candidates
-from bayessim_mjx.diagnosis.phrases import first_look
+from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.effects import load as effect
 
 LOAD = rigs.Truth("payload", "tool", (1.0, 0.05, 0.0, 0.02))
@@ -45,14 +45,14 @@ def test_a_load_is_found_where_it_is(loaded):
 
 
 def test_motors_that_obey_and_a_heavier_mechanism_are_told_apart(loaded, weak):
-    assert first_look.verdict(loaded) == (
+    assert notes.first_verdict(loaded) == (
         "the motors follow their commands, but the mechanism is heavier or stiffer than the model"
     )
-    assert first_look.verdict(weak[1]) == (
+    assert notes.first_verdict(weak[1]) == (
         "the motors do not follow their commands, but the mechanism moves as the model predicts"
     )
-    assert any("extra payload at tool: mass" in line for line in first_look.lines(loaded))
-    assert any("elbow_motor 0.80 of it" in line for line in first_look.lines(weak[1]))
+    assert any("extra payload at tool: mass" in line for line in notes.first_look(loaded))
+    assert any("elbow_motor 0.80 of it" in line for line in notes.first_look(weak[1]))
 
 
 @pytest.mark.slow
@@ -64,7 +64,7 @@ def test_a_weak_motor_is_found_with_and_without_measured_effort(weak):
     blind = check(logs, model)
     assert proposed(blind)["actuator_gain@elbow_motor"]["gain"] == pytest.approx(0.8, abs=0.03)
     assert "actuator_gain@all" in blind.vetoes  # the others are not weak
-    assert first_look.verdict(blind) == ""
+    assert notes.first_verdict(blind) == ""
 
 
 def test_leads_start_and_veto_candidates(weak, tmp_path):
@@ -103,7 +103,7 @@ def test_nothing_to_look_at_is_no_error(loaded):
     model, logs = recorded(rigs.Truth(), runs=1, seconds=0.5)
     still = dataclasses.replace(logs[0], qpos=0 * logs[0].qpos, qvel=0 * logs[0].qvel)
     assert check([still], model).joints == ()
-    assert "no joint" in first_look.lines(check([still], model))[0]
+    assert "no joint" in notes.first_look(check([still], model))[0]
 
 
 def test_a_drive_that_is_heavier_and_stiffer_than_modelled_is_no_weak_motor():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import check
-from bayessim_mjx.diagnosis.phrases import first_look
+from bayessim_mjx.diagnosis.phrases import notes
 from tests.diagnosis.recordings import record
 
 SERVO = """<mujoco><compiler autolimits="true"/><option timestep="0.001" integrator="implicitfast"/><worldbody><body>
@@ -34,7 +34,7 @@ def test_a_gain_of_the_firmware_is_proposed_in_its_own_unit(kp, kv, most, rotor,
     name, true, model = ("servo_stiffness", kp, 20.0) if kp != 20.0 else ("servo_damping", kv, 0.3)
     assert seen.proposals[0].label == f"{name}@servo"
     assert model * seen.proposals[0].parameters["factor"] == pytest.approx(true, rel=0.12)
-    assert f", not {model:g}" in " ".join(first_look.lines(seen))
+    assert f", not {model:g}" in " ".join(notes.first_look(seen))
 
 
 @pytest.mark.parametrize("kp", [20.0, 400.0])  # the second one moves between the rows of a log
@@ -56,4 +56,4 @@ def test_a_gain_that_the_logs_declare_wrongly_is_proposed(kp: float, kd: float, 
     name, true, known = ("controller_stiffness", kp, declared) if kp != declared else ("controller_damping", kd, 0.3)
     assert seen.proposals[0].label == f"{name}@servo"
     assert known * seen.proposals[0].parameters["factor"] == pytest.approx(true, rel=0.12)
-    assert f", not {known:g}" in " ".join(first_look.lines(seen))
+    assert f", not {known:g}" in " ".join(notes.first_look(seen))

@@ -1,6 +1,6 @@
 """The next experiment in words: sentences known beforehand."""
 
-from bayessim_mjx.diagnosis.phrases import experiment as phrases
+from bayessim_mjx.diagnosis.phrases import advice as phrases
 from bayessim_mjx.diagnosis.phrases.effects import all_of
 
 
