@@ -142,9 +142,9 @@ def _recordings(args: argparse.Namespace, model: Any) -> Iterator["Recording"]:
 
             yield pace.of_file(path, args.joints)
         else:
-            from bayessim_mjx.logs.importers import ros, ros_files
+            from bayessim_mjx.logs.importers import messages, ros
 
-            read = ros_files.of_mcap if args.format == "from-mcap" else ros_files.of_rosbag
+            read = messages.of_mcap if args.format == "from-mcap" else messages.of_rosbag
             yield ros.recording(path.stem, read(path), _choice(args, model))
 
 

@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any
 
 from bayessim_mjx import cli
-from bayessim_mjx.cli import commands, completion
+from bayessim_mjx.cli import commands
 from bayessim_mjx.config import Config, to_yaml
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError, unknown
@@ -235,7 +235,7 @@ def _help(argv: Sequence[str] | None) -> int:
 
 def _completion_parser() -> cli.PlainParser:
     parser = cli.PlainParser("completion", description=COMPLETION, usage="%(prog)s SHELL")
-    parser.add_argument("shell", choices=completion.SHELLS, help="whose script")
+    parser.add_argument("shell", choices=commands.SHELLS, help="whose script")
     return parser
 
 
@@ -244,7 +244,7 @@ def _completion(argv: Sequence[str] | None) -> int:
     parser = _completion_parser()
     shell, own = parser.parse_args(argv).shell, {"main": _parser(), "completion": parser, "help": _help_parser()}
     of = {name: own.get(name) or _module(name)._parser() for name in commands.COMMANDS}
-    print(completion.script(shell, {name: (commands.COMMANDS[name].about, of[name]) for name in of}))
+    print(commands.script(shell, {name: (commands.COMMANDS[name].about, of[name]) for name in of}))
     return 0
 
 

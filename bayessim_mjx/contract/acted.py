@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.contract.amounts import NEAR
+from bayessim_mjx.contract.axes import NEAR
 from bayessim_mjx.contract.axes import findings as of_order
 from bayessim_mjx.contract.evidence import Evidence, Finding, Result, shifted
-from bayessim_mjx.contract.judged import judge
 from bayessim_mjx.contract.manifest import Entry
 from bayessim_mjx.contract.relate import Relation, relate
+from bayessim_mjx.contract.words import judge
 
 Array = NDArray[np.float64]
 DIGITS = 1e-3  # of an action: three digits of a log; a rule of thumb

@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.contract.manifest import Entry, Manifest
-from bayessim_mjx.contract.network import Network
+from bayessim_mjx.contract.manifest import Entry, Manifest, Network
 from bayessim_mjx.contract.recording import Run
 from bayessim_mjx.contract.state import State
 

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.contract import amounts, axes
+from bayessim_mjx.contract import axes
 from bayessim_mjx.contract.evidence import Evidence, Finding, Result
-from bayessim_mjx.contract.judged import judge
 from bayessim_mjx.contract.manifest import Entry
 from bayessim_mjx.contract.relate import DELAYS, TOLD, Relation, relate, unexplained
 from bayessim_mjx.contract.state import FRAMES, VECTORS
+from bayessim_mjx.contract.words import judge
 
 Array = NDArray[np.float64]
 MOST = 0.8  # of the entries have to follow a rule that is meant for all; a rule of thumb
@@ -195,9 +195,9 @@ def _normalised(evidence: Evidence) -> bool:
         expected = evidence.reference([entry])("", 0) if entry.terms else None
         if expected is None or _left(evidence.seen[:, [i]], expected)[0] > TOLD:
             continue
-        found = amounts.line(evidence.seen[:, i], expected[:, 0])
-        start, sd = amounts.starting(evidence.seen[:, i], expected[:, 0], 1 / manifest.std[i])
-        near = abs(start + manifest.mean[i] / manifest.std[i]) <= amounts.OFFSET / manifest.std[i] + 5 * sd
-        right.append(amounts.fits(found, 1.0))
-        through.append(amounts.fits(found, 1 / manifest.std[i]) and near)
+        found = axes.line(evidence.seen[:, i], expected[:, 0])
+        start, sd = axes.starting(evidence.seen[:, i], expected[:, 0], 1 / manifest.std[i])
+        near = abs(start + manifest.mean[i] / manifest.std[i]) <= axes.OFFSET / manifest.std[i] + 5 * sd
+        right.append(axes.fits(found, 1.0))
+        through.append(axes.fits(found, 1 / manifest.std[i]) and near)
     return len(through) > 1 and bool(np.mean(through) >= MOST > np.mean(right))

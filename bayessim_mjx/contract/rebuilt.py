@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.contract.amounts import UNITS
+from bayessim_mjx.contract.axes import UNITS
 from bayessim_mjx.contract.evidence import Evidence, Finding, Result, shifted
 from bayessim_mjx.contract.manifest import Entry
 from bayessim_mjx.contract.observed import groups

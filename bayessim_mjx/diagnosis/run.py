@@ -179,9 +179,8 @@ def diagnose(
     flags = [[texts] if isinstance(texts, str) else texts for texts in (accuracy, payload, tolerance)]
     with noting() as noticed:
         robot = robot_of(model, parameters).stated(*flags[:2])
-        recorded = given
-        if not all(isinstance(log, Log) for log in given):
-            recorded = read_logs(given if len(given) > 1 else given[0], robot.mj_model, map, partial=True)
+        read = all(isinstance(log, Log) for log in given)
+        recorded = given if read else read_logs(given if given[1:] else given[0], robot.mj_model, map, partial=True)
     about = header(robot, model, given, recorded) | {"seed": seed} | dict(about or {})
     files = Files(None if out is None else Path(out), about, progress, early)
     request = Request(

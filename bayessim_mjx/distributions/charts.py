@@ -6,6 +6,8 @@ logit: z = log(u / (1 - u)); the prior is logistic, nothing is cut off.
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,3 +53,27 @@ def log_slope(z: Array, chart: str) -> Array:
     if chart == "probit":
         return jnp.sum(0.5 * z * z + np.float32(0.5 * np.log(2 * np.pi)), axis=-1)
     return jnp.sum(jax.nn.softplus(z) + jax.nn.softplus(-z), axis=-1)
+
+
+# The numbers that a Distribution is made of, as the functions on them read them
+
+
+class Parts(Protocol):
+    """See `Distribution`."""
+
+    @property
+    def prior_weight(self) -> Array: ...
+    @property
+    def logits(self) -> Array: ...
+    @property
+    def means(self) -> Array: ...
+    @property
+    def scales(self) -> Array: ...
+    @property
+    def log_inside(self) -> Array: ...
+    @property
+    def space(self) -> Any: ...
+    @property
+    def chart(self) -> str: ...
+    @property
+    def components(self) -> int: ...

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.distributions import algebra, box, charts, evaluate
-from bayessim_mjx.distributions.parts import Parts
+from bayessim_mjx.distributions.charts import Parts
 from bayessim_mjx.errors import UserError
 
 ROUNDING = 1e-5  # of unit coordinates in float32

@@ -13,7 +13,7 @@ from jax import Array
 from jax.scipy.special import ndtri
 
 from bayessim_mjx.distributions import box, charts
-from bayessim_mjx.distributions.parts import Parts
+from bayessim_mjx.distributions.charts import Parts
 from bayessim_mjx.linalg import lower_factor, product, solve_lower
 
 LEVEL_OUT = 0.01  # nats between the ends of the range, by which regions of a flat density are chosen

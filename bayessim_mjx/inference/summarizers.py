@@ -18,9 +18,8 @@ from bayessim_mjx.config.names import SUMMARIES
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import summaries
 from bayessim_mjx.inference.summaries import Stream, Summarizer
-from bayessim_mjx.inference.summaries.correlations import summary_corr, summary_corrdiff
+from bayessim_mjx.inference.summaries.correlations import summary_corr, summary_corrdiff, summary_start, summary_waypts
 from bayessim_mjx.inference.summaries.learned import summary_learned
-from bayessim_mjx.inference.summaries.rows import summary_start, summary_waypts
 from bayessim_mjx.inference.summaries.signatures import summary_logsignature, summary_signatory
 
 __all__ = [

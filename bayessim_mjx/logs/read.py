@@ -18,12 +18,11 @@ from bayessim_mjx.logs.csv_files import read_csv
 from bayessim_mjx.logs.doubts import check_units, say_better_clock
 from bayessim_mjx.logs.files import FORMAT, Paths, distinct, files_of, map_of_folder, side_yaml
 from bayessim_mjx.logs.inertial import having, onto_encoders
-from bayessim_mjx.logs.jsonl import read_jsonl
 from bayessim_mjx.logs.log import HOLDS, Array, Channels, Log, suggest
 from bayessim_mjx.logs.mapping import LogMap
 from bayessim_mjx.logs.pieces import MIN_ROWS, pieces
 from bayessim_mjx.logs.proposal import hint
-from bayessim_mjx.logs.table import Table, read_npz
+from bayessim_mjx.logs.table import Table, read_jsonl, read_npz
 from bayessim_mjx.physics import controllers
 
 LATEST = 1.0  # s by which commands may act, or an inertial unit may read, later or earlier than their rows say

@@ -22,7 +22,7 @@ from bayessim_mjx.keys import branch
 from bayessim_mjx.loop.sources import Source
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.parameters.ranged import Ranged
-from bayessim_mjx.physics.contact import collides
+from bayessim_mjx.physics.visuals import collides
 from bayessim_mjx.rl import Policy, TrainState
 from bayessim_mjx.rollout import Trajectory
 

@@ -13,7 +13,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.inertial import NAMES, having
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.signals import derivative
-from bayessim_mjx.odometry import feet, imu, settling, smoother, stand
+from bayessim_mjx.odometry import feet, imu, smoother, stand
 from bayessim_mjx.odometry.imu import Sensor
 from bayessim_mjx.odometry.smoother import Inputs, Noise, Track
 
@@ -230,8 +230,8 @@ def completed(log: Log, model: mujoco.MjModel) -> tuple[Log, Base | None]:
     base = estimate(log, model)
     posture = np.array(log.qpos[0])
     posture[log.channels.columns(name)] = base.qpos[0]
-    deep = settling.depth(model, posture)
-    pose, spread = settling.settled(base.qpos, base.covariance, base.points, deep)
+    deep = stand.depth(model, posture)
+    pose, spread = stand.settled(base.qpos, base.covariance, base.points, deep)
     sd = np.sqrt(np.median(np.diagonal(spread, axis1=1, axis2=2), axis=0))
     tilt = float(np.sqrt(np.mean(sd[3:5] ** 2)))  # the heading's is that of the tilt: nothing depends on either
     sigma = np.concatenate([np.full(3, sd[2]), np.full(4, tilt / 2)])  # `Log.sigma_dofs`; so does nothing on x and y

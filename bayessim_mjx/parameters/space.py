@@ -9,12 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.parameters import priors
 from bayessim_mjx.parameters.parameter import Parameter
 
 if TYPE_CHECKING:
     import mujoco
     from mujoco import mjx
+
+
+from typing import Protocol
+
+from jax.scipy.special import ndtr, ndtri
 
 
 @jax.tree_util.register_static
@@ -108,11 +112,11 @@ class ParameterSpace:
 
     def to_unit(self, theta: Any) -> jax.Array:
         """Elementwise prior CDF, `[..., d]` -> [0, 1]: every prior is uniform on the unit cube in these coordinates."""
-        return priors.to_unit(self, jnp.asarray(theta, jnp.float32))
+        return to_unit(self, jnp.asarray(theta, jnp.float32))
 
     def from_unit(self, u: Any) -> jax.Array:
         """Inverse of `to_unit`, `[..., d]`; never outside [low, high]."""
-        return priors.from_unit(self, jnp.asarray(u, jnp.float32))
+        return from_unit(self, jnp.asarray(u, jnp.float32))
 
     def scheduled(self, theta: Any, clock: jax.Array) -> jax.Array:
         """theta `[..., d]` as training draws it after `clock` control steps: nominal + strength * (theta - nominal)."""
@@ -124,7 +128,7 @@ class ParameterSpace:
     def log_prior(self, theta: Any) -> jax.Array:
         """Joint log density of the priors in theta units, `[..., d]` -> `[...]`; -inf outside the box."""
         theta = jnp.asarray(theta, jnp.float32)
-        return jnp.where(self.contains(theta), jnp.sum(priors.log_density(self, theta), axis=-1), -jnp.inf)
+        return jnp.where(self.contains(theta), jnp.sum(log_density(self, theta), axis=-1), -jnp.inf)
 
     def write(self, model: "mjx.Model", theta: Any, derived: bool = True) -> "mjx.Model":
         """Write theta `[d]` into the nominal `model`, derived constants recomputed. Pure; use under `vmap`.
@@ -152,3 +156,86 @@ def _frozen(values: Iterable[float]) -> np.ndarray:
     array = np.asarray(list(values), np.float32)
     array.setflags(write=False)
     return array
+
+
+# Prior CDF, its inverse and log density, elementwise over the parameters of a space
+
+
+class Space(Protocol):
+    """What is read of a `ParameterSpace`, `[d]` each."""
+
+    parameters: tuple[Parameter, ...]
+    low: Any  # numpy's, known when a program is compiled, or arrays of a `Ranged` space
+    high: Any
+
+
+def _library(space: Space) -> Any:
+    """Choose the library that computes with the ends of the ranges: constants stay numpy's."""
+    return np if isinstance(space.low, np.ndarray) else jnp
+
+
+def to_unit(space: Space, theta: jax.Array) -> jax.Array:
+    """theta `[..., d]` -> CDF values `[..., d]`; 0 below and 1 above the range."""
+    theta = jnp.clip(theta, space.low, space.high)
+    u = (theta - space.low) / (space.high - space.low)
+    log, gauss = _is(space, "loguniform"), _is(space, "gaussian")
+    if log.any():
+        xp = _library(space)
+        low, high = xp.where(log, space.low, 1.0), xp.where(log, space.high, 2.0)
+        # u = ln(theta / low) / ln(high / low)
+        u = jnp.where(log, jnp.log(jnp.where(log, theta, 1.0) / low) / xp.log(high / low), u)
+    if gauss.any():
+        mean, sd, a, b = _normal(space)
+        # u = (Phi(z) - Phi(a)) / (Phi(b) - Phi(a))
+        u = jnp.where(gauss, (ndtr((theta - mean) / sd) - ndtr(a)) / (ndtr(b) - ndtr(a)), u)
+    return jnp.clip(u, 0.0, 1.0)
+
+
+def from_unit(space: Space, u: jax.Array) -> jax.Array:
+    """CDF values `[..., d]` -> theta `[..., d]`, clipped to the range."""
+    u = jnp.clip(u, 0.0, 1.0)
+    theta = space.low + u * (space.high - space.low)
+    log, gauss = _is(space, "loguniform"), _is(space, "gaussian")
+    if log.any():
+        xp = _library(space)
+        low, high = xp.where(log, space.low, 1.0), xp.where(log, space.high, 2.0)
+        theta = jnp.where(log, low * jnp.exp(u * xp.log(high / low)), theta)
+    if gauss.any():
+        mean, sd, a, b = _normal(space)
+        theta = jnp.where(gauss, mean + sd * ndtri(ndtr(a) + u * (ndtr(b) - ndtr(a))), theta)
+    # the ends exactly, and no rounding beyond them
+    theta = jnp.where(u <= 0.0, space.low, jnp.where(u >= 1.0, space.high, theta))
+    return jnp.clip(theta, space.low, space.high)
+
+
+def log_density(space: Space, theta: jax.Array) -> jax.Array:
+    """Log density per parameter `[..., d]`, in theta units; meaningful inside the range only."""
+    xp = _library(space)
+    width = (space.high - space.low).astype(np.float64 if xp is np else np.float32)
+    density = jnp.broadcast_to(jnp.asarray(-xp.log(width), jnp.float32), theta.shape)
+    log, gauss = _is(space, "loguniform"), _is(space, "gaussian")
+    if log.any():
+        low, high = xp.where(log, space.low, 1.0), xp.where(log, space.high, 2.0)
+        # p = 1 / (theta ln(high / low))
+        safe = jnp.where(log & (theta > 0), theta, 1.0)
+        density = jnp.where(log, -jnp.log(safe) - xp.log(xp.log(high / low)), density)
+    if gauss.any():
+        mean, sd, a, b = _normal(space)
+        z = (theta - mean) / sd
+        mass = jnp.log(ndtr(b) - ndtr(a))
+        density = jnp.where(gauss, -0.5 * z**2 - jnp.log(sd) - 0.5 * np.log(2 * np.pi) - mass, density)
+    return density
+
+
+def _is(space: Space, prior: str) -> np.ndarray:
+    return np.asarray([p.prior == prior for p in space.parameters], bool)
+
+
+def _normal(space: Space) -> tuple[np.ndarray, np.ndarray, Any, Any]:
+    """mean, sd and the standardised ends; harmless numbers in the columns of other priors."""
+    gauss = _is(space, "gaussian")
+    mean = np.asarray([p.mean if g else 0.0 for p, g in zip(space.parameters, gauss, strict=True)], np.float32)
+    sd = np.asarray([p.sd if g else 1.0 for p, g in zip(space.parameters, gauss, strict=True)], np.float32)
+    xp = _library(space)
+    a, b = xp.where(gauss, (space.low - mean) / sd, -1.0), xp.where(gauss, (space.high - mean) / sd, 1.0)
+    return mean, sd, a.astype(np.float32), b.astype(np.float32)

@@ -148,3 +148,24 @@ def _of_actuator(given: Mapping[str, Any], name: str, actuators: Sequence[str], 
     if row["law"] != "direct" and not row["kp"] > 0:
         raise UserError(f"{source}: controller.law = {row['law']} of actuator {name!r} needs kp > 0, has {row['kp']:g}")
     return row
+
+
+# What acts on a world besides its command and its effects
+
+
+class Drive(struct.PyTreeNode):
+    """What acts on a world besides its command, all optional.
+
+    Attributes:
+        force: `[nv]`, a generalised force of unknown origin.
+        enabled: `[nu]`, 1 where the drive is on; 0: the actuator exerts no force at all (open leads), and a joint whose
+            actuators are all off has no gravity compensation from them either (`actuatorgravcomp`).
+        law: a controller between the command and the actuators; what it asks for is held over a timestep.
+        active: `[effects]`, False where an effect is neutral in every world of the call, so that its hooks need not be
+            computed (`physics.model.gated`).
+    """
+
+    force: jax.Array | None = None
+    enabled: jax.Array | None = None
+    law: Law | None = None
+    active: jax.Array | None = None

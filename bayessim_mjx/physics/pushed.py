@@ -8,7 +8,7 @@ import numpy as np
 
 from bayessim_mjx.compat import mjx
 from bayessim_mjx.effects.support.substep import SubStep
-from bayessim_mjx.physics.drive import Drive
+from bayessim_mjx.physics.controllers import Drive
 from bayessim_mjx.physics.gates import chained
 from bayessim_mjx.physics.model import IMPLICITFAST, Physics
 

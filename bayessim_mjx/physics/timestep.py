@@ -15,7 +15,7 @@ import numpy as np
 from bayessim_mjx.compat import mjx
 from bayessim_mjx.effects.support.site import joint_dofs, ranges
 from bayessim_mjx.effects.support.substep import SubStep
-from bayessim_mjx.physics.drive import Drive
+from bayessim_mjx.physics.controllers import Drive
 from bayessim_mjx.physics.gates import chained_in
 from bayessim_mjx.physics.model import EULER, IMPLICITFAST, RK4, Physics
 from bayessim_mjx.physics.pushed import Memory, pushed

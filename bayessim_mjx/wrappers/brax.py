@@ -8,7 +8,7 @@ from typing import Any
 
 from bayessim_mjx.env import Env
 from bayessim_mjx.external import BraxEnv, make_brax, make_playground
-from bayessim_mjx.wrappers.under import Under
+from bayessim_mjx.wrappers.fresh import Under
 from bayessim_mjx.wrappers.worlds import environment
 
 __all__ = ["BraxEnv", "make_brax", "make_playground", "ours", "train"]

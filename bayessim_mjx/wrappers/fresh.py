@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 from brax.envs.base import Wrapper
 from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 from flax import struct
@@ -16,10 +17,10 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env, State
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.keys import branch
+from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.parameters.parameter import OVER
 from bayessim_mjx.rl.worlds import clock, drawn, reset_at
 from bayessim_mjx.rollout import next_episodes, select
-from bayessim_mjx.wrappers.under import Under
 
 STORE, OURS = "fresh", "ours"  # in `info`: episodes to begin with; what our environment keeps there
 
@@ -110,3 +111,49 @@ class FreshEpisodes(Wrapper):
         world, obs, kept = select(ended, new, old)
         left = Store(jnp.where(empty, key, store.key), fresh, (store.used & ~empty) | ended)
         return after.replace(pipeline_state=world, obs=obs, info={**after.info, OURS: kept, STORE: left})
+
+
+# An environment of ours whose `reset(key)` draws its own physics, for trainers that know no theta
+
+
+class Under(Env):
+    """`env` under `domain`: a reset without theta draws it (domain None: the nominal one).
+
+    In its own resets all schedules are over. `wrappers.fresh.wrap` begins them at its first reset, but where
+    `schedules_over`, as evaluations want it.
+    """
+
+    def __init__(self, env: Env, domain: Distribution | None, schedules_over: bool = False) -> None:
+        self.env, self.domain, self.schedules_over = env, domain, schedules_over
+        self.name, self.episode_length = env.name, env.episode_length
+        self.mirrors, self.nuisance = env.mirrors, env.nuisance
+
+    def reset(self, key: jax.Array, theta: jax.Array | None = None) -> State:
+        if theta is None and self.domain is not None:
+            key, theta_key = jax.random.split(key)
+            theta = self.domain.sample(theta_key, 1)[0]
+        return self.env.reset(key, theta)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return self.env.step(state, action)
+
+    @property
+    def action_size(self) -> int:
+        return self.env.action_size
+
+    @property
+    def dt(self) -> float:
+        return self.env.dt
+
+    @property
+    def space(self) -> ParameterSpace:
+        return self.env.space
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        return self.env.mj_model
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "env":
+            raise AttributeError(name)
+        return getattr(self.env, name)

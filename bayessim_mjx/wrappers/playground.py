@@ -15,7 +15,7 @@ from bayessim_mjx.env import Env
 from bayessim_mjx.env import State as OurState
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.task_names import names
-from bayessim_mjx.wrappers.under import Under
+from bayessim_mjx.wrappers.fresh import Under
 from bayessim_mjx.wrappers.worlds import environment
 
 try:

@@ -19,8 +19,8 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 from scipy.optimize import brentq
 
+from bayessim_mjx.blind.cases import known, plan, rounds
 from bayessim_mjx.blind.curves import WANTED, Curves, Group, Trial
-from bayessim_mjx.blind.plan import known, plan, rounds
 
 Law = Callable[[float], float]  # log strength less log threshold, over the curve's width -> share found, without lapses
 

@@ -17,7 +17,7 @@ import suite
 from systems import SYSTEMS
 
 from bayessim_mjx import atomic
-from bayessim_mjx.blind.plan import KINDS
+from bayessim_mjx.blind.cases import KINDS
 from bayessim_mjx.blind.reality.plant import Plant
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from bayessim_mjx.blind import plan
+from bayessim_mjx.blind import cases
 from bayessim_mjx.blind.amounts import AMOUNTS, amount_of, in_words, unit_of
+from bayessim_mjx.blind.answer import amount_at
 from bayessim_mjx.blind.curves import LAPSE, Curves, Trial, chance
-from bayessim_mjx.blind.findings import amount_at
 from bayessim_mjx.blind.reality.menu import KNOWN
 
 
@@ -69,30 +69,30 @@ def test_drawn_numbers_have_the_chances_of_their_curves():
 
 def test_later_strengths_are_drawn_where_an_effect_begins_to_be_found():
     groups = [(f"e{i}", "p0") for i in range(4)]
-    items = plan.plan(range(32, 72), groups, [("unknown", "x")], step(10.0), seed=0)
+    items = cases.plan(range(32, 72), groups, [("unknown", "x")], step(10.0), seed=0)
     strengths = [i.strength for i in items if i.kind == "single"]
     assert 5 < np.median(strengths) < 20 and np.mean([3 < s < 40 for s in strengths]) > 0.85
 
 
 def test_a_round_waits_for_the_cases_four_rounds_before_it_whatever_is_asked_for_in_all():
-    rounds = plan.rounds(60)
-    assert [plan.known(r) for r in rounds] == [0, 0, 0, 0, 16, 24, 32]
-    assert [plan.known(r) for r in plan.rounds(100)][: len(rounds)] == [plan.known(r) for r in rounds]
-    assert all(r.start - plan.known(r) <= 40 for r in plan.rounds(200))  # so many cores have work
+    rounds = cases.rounds(60)
+    assert [cases.known(r) for r in rounds] == [0, 0, 0, 0, 16, 24, 32]
+    assert [cases.known(r) for r in cases.rounds(100)][: len(rounds)] == [cases.known(r) for r in rounds]
+    assert all(r.start - cases.known(r) <= 40 for r in cases.rounds(200))  # so many cores have work
 
 
 def test_a_round_follows_from_the_seed_and_the_cases_before_it_alone():
     groups, trials = [("a", "p"), ("a", "q"), ("b", "p")], step(10.0)
-    first = plan.plan(range(16, 24), groups, [("u", "p")], trials, seed=3)
-    assert first == plan.plan(range(16, 24), groups, [("u", "p")], trials, seed=3)
-    assert first != plan.plan(range(16, 24), groups, [("u", "p")], trials, seed=4)
-    assert first[:4] == plan.plan(range(16, 20), groups, [("u", "p")], trials, seed=3)
-    assert plan.rounds(40)[:3] == plan.rounds(100)[:3] and plan.rounds(5) == [range(0, 5)]
+    first = cases.plan(range(16, 24), groups, [("u", "p")], trials, seed=3)
+    assert first == cases.plan(range(16, 24), groups, [("u", "p")], trials, seed=3)
+    assert first != cases.plan(range(16, 24), groups, [("u", "p")], trials, seed=4)
+    assert first[:4] == cases.plan(range(16, 20), groups, [("u", "p")], trials, seed=3)
+    assert cases.rounds(40)[:3] == cases.rounds(100)[:3] and cases.rounds(5) == [range(0, 5)]
 
 
 def test_effects_and_places_take_turns():
     groups = [(e, w) for e in "abc" for w in "pq"]
-    turns = [plan.in_turn(groups, k, seed=0) for k in range(6)]
+    turns = [cases.in_turn(groups, k, seed=0) for k in range(6)]
     assert {e for e, _ in turns[:3]} == set("abc") and set(turns) == set(groups)
 
 

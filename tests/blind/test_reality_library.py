@@ -12,8 +12,8 @@ import pytest
 from bayessim_mjx import effects
 from bayessim_mjx.blind.check import Check, effects_of, unasked
 from bayessim_mjx.blind.reality import twin
+from bayessim_mjx.blind.reality.bodies import ground
 from bayessim_mjx.blind.reality.drives import quickest
-from bayessim_mjx.blind.reality.links import ground
 from bayessim_mjx.blind.reality.menu import CAUSES, KNOWN
 from bayessim_mjx.blind.reality.plant import Plant, scales_of
 from bayessim_mjx.blind.reality.strength import Ruler, resize

@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from bayessim_mjx.blind.reality.bodies import ground, lift
 from bayessim_mjx.blind.reality.drives import quickest
-from bayessim_mjx.blind.reality.links import ground, lift
 from bayessim_mjx.blind.reality.menu import places
 from bayessim_mjx.blind.reality.plant import Plant
 from bayessim_mjx.blind.reality.system import System

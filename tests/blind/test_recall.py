@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from bayessim_mjx.blind import findings
+from bayessim_mjx.blind import answer
 from bayessim_mjx.blind.recall import beside, recall
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.report.page import render
@@ -58,11 +58,11 @@ def row(**changes):
 
 
 def test_a_sentence_says_what_would_not_have_been_seen():
-    assert findings.sentence(row()) == (
+    assert answer.sentence(row()) == (
         "backlash at elbow under 0.17 deg (half of the play) would not have been seen reliably: it is found 9 times of "
         "10 from there on (90 % interval 0.1 deg to 0.3 deg)"
     )
     limit = row(effect="rate_limit", told="< 29/s", beyond=True)
-    assert findings.sentence(limit) == (
+    assert answer.sentence(limit) == (
         "rate limit at elbow: even 29/s (limit), the strongest that was tried, was not seen"
     )

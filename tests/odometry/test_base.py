@@ -10,7 +10,7 @@ from bayessim_mjx.diagnosis.fitting import observation
 from bayessim_mjx.diagnosis.logcheck.noise import noise_of
 from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.odometry import base, feet, imu, settling, stand
+from bayessim_mjx.odometry import base, feet, imu, stand
 from tests.odometry.floating import BIAS, STOOL, record, swaying
 
 
@@ -115,7 +115,7 @@ def test_the_depth_of_feet_is_that_of_a_robot_that_stands(model):
     mujoco.mj_forward(model, data)
     deep = np.mean([-c.dist for c in data.contact[: data.ncon]])
     high = np.concatenate([pose[-1] + np.array([0, 0, 0.2, 0, 0, 0, 0]), log.qpos[-1, 7:]])
-    assert data.ncon == 3 and settling.depth(model, high) == pytest.approx(deep, rel=0.2)
+    assert data.ncon == 3 and stand.depth(model, high) == pytest.approx(deep, rel=0.2)
 
 
 def test_an_orientation_sensor_narrows_the_tilt(model, swayed):

@@ -3,7 +3,7 @@
 import mujoco
 import pytest
 
-from bayessim_mjx.physics.contact import collides
+from bayessim_mjx.physics.visuals import collides
 
 FLOOR = '<geom type="plane" size="1 1 .1"/>'
 

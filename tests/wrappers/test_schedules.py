@@ -8,8 +8,8 @@ import pytest
 from bayessim_mjx import config, registry
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.wrappers import fresh
+from bayessim_mjx.wrappers.fresh import Under
 from bayessim_mjx.wrappers.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
-from bayessim_mjx.wrappers.under import Under
 from bayessim_mjx.wrappers.worlds import Worlds
 
 N, RAMP, LENGTH = 8, 20, 5

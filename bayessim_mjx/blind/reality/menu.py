@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayessim_mjx.blind.reality import actuators, bodies, drives, joints, medium, others, unknown
+from bayessim_mjx.blind.reality import actuators, bodies, drives, joints, others, unknown
 from bayessim_mjx.blind.reality.cause import Cause, Scales
 from bayessim_mjx.blind.reality.plant import Rig
 
@@ -16,7 +16,7 @@ def _causes(*rooms: object) -> dict[str, type[Cause]]:
     return {c.name: c for c in every if "name" in vars(c)}
 
 
-KNOWN = _causes(joints, actuators, others, drives, bodies, medium)
+KNOWN = _causes(joints, actuators, others, drives, bodies)
 UNKNOWN = _causes(unknown)  # no library has them
 CAUSES = KNOWN | UNKNOWN
 

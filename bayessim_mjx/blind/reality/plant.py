@@ -10,8 +10,8 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
+from bayessim_mjx.blind.reality.bodies import axis, chain, ground, length, turns
 from bayessim_mjx.blind.reality.cause import Cause, Past, Scales
-from bayessim_mjx.blind.reality.links import axis, chain, ground, length, turns
 
 FINER = 10  # times, of the steps in reality, so that its own error of integration is small beside the nominal one
 WIDTHS = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of free, ball, slide and hinge joints in qpos and qvel

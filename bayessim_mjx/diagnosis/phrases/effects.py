@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.selection.bounds import Bound
 
 
-from __future__ import annotations
-
 CONTAINS = "contains it as a special case and explains no more"
 NO_GAIN = "no gain at first order"  # why effects were not fitted
 LESS_PROMISING = "less promising than those that were fitted"

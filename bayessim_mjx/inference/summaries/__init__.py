@@ -7,12 +7,12 @@ A user's own is registered by a call of `register`, or by an entry point of the 
 from typing import Any
 
 from bayessim_mjx.config.names import SUMMARIES, summary_of
-from bayessim_mjx.inference.summaries import correlations, learned, rows, signatures
+from bayessim_mjx.inference.summaries import correlations, learned, signatures
 from bayessim_mjx.inference.summaries.summary import Stream, Summarizer, Summary, held, register
 
 __all__ = ["Stream", "Summarizer", "Summary", "entry", "held", "names", "register"]
 
-LIBRARY = (rows, correlations, signatures, learned)  # importing them registers what they define
+LIBRARY = (correlations, signatures, learned)  # importing them registers what they define
 
 
 def names() -> list[str]:
