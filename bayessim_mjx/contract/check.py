@@ -89,8 +89,10 @@ def _pairs(path: Path, contract: manifest.Manifest) -> dict[str, NDArray[np.floa
 
 
 Array = NDArray[np.float64]
-DELAYS = (0, 1, 2)  # steps by which a drive may get its target late
-MOVED = 0.08  # share of a joint's way that a target has to explain to be told; with 100 rows chance gives 0.04
+DELAYS = (0, 1, 2)  # steps by which a drive may get its target late; a rule of thumb
+# Share of a joint's way that a target has to explain to be its own: twice what chance explains of 100 rows in one case
+# of 20, the 95 % point of chi-squared with one degree of freedom over the rows (.04). The factor is a rule of thumb.
+MOVED = 0.08
 AHEAD = 3  # steps of that way: drives of legs need as long; a rule of thumb
 CLEAR = 4.0  # factor by which another target has to explain more: legs push each other over the ground; a rule of thumb
 APART = 0.1  # share of a target's spread that place and speed have to leave: it is no copy of them; a rule of thumb

@@ -16,11 +16,11 @@ BETTER_FRAME = 4.0  # factor by which another frame explains entries better, or 
 BETTER_ORDER = 2.0  # factor by which another order explains the entries that it moves better; a rule of thumb
 BETTER_DELAY = 1.3  # factor by which a delay explains entries better; sampling alone gives 1.1; a rule of thumb
 LATE = 0.7  # steps from which on a delay counts: logs may be written half a step after a measurement; rule of thumb
-DELAYS = (-1, 0, 1, 2, 3, 4)  # steps, candidates
+DELAYS = (-1, 0, 1, 2, 3, 4)  # steps by which a state may stand in the log late, all tried; a rule of thumb
 ROWS = 12  # rows that a relation needs at least; a rule of thumb
 STALE = 0.05  # share of steps with an old value that counts: networks lose one in a hundred; a rule of thumb
 
-PARTS = (0.25, 0.5, 0.75)  # of a step: a log is written a part of a step after a measurement
+PARTS = (0.25, 0.5, 0.75)  # of a step, tried too: a log is written a part of it after a measurement; a rule of thumb
 FLAT = 5.0  # degrees, of a turn of axes that is none; a rule of thumb
 Reference = Callable[[str, float], "Array | None"]  # (frame, steps of delay) -> [N, g]
 

@@ -132,7 +132,7 @@ def _alike(one: Finding, two: axes.Fault) -> bool:
     return one.found == two.found and one.expected == two.expected
 
 
-MOST = 4  # names that a sentence lists; more only by their number
+MOST = 4  # names that a sentence lists; more only by their number; a rule of thumb
 SENTENCES = {
     "order": "they show {found}",
     "frame": "in {frame}",

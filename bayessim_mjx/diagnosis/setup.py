@@ -154,28 +154,21 @@ def prepare(
     cut = timed.cut(physics, request.quick)
     simulator = Simulator(physics, cut)
     base = candidates.base_coordinates(timed.robot.space, timed.robot.accuracy, timed.robot.assumed)
+    fitter = Fitter(simulator, base, physics.space.nominal)
     led = inverse_dynamics_check.lead(candidates.enumerate_candidates(physics), checked.look)
     allowed = allows(cut.sigma_q)
     untried = [f"not tried: {text}" for text in left_out]
     few = [*notes.conditions(len(cut.groups), cut.blocks), *notes.below_noise(allowed)]
     units = notes.inertial(checked.bases, [stand.measure(log, robot.mj_model) for log in usable])
-    warnings = [
-        *checked.notes,
-        *units,
-        *timed.notes,
-        *timed.warnings,
-        *untried,
-        *cut.notes,
-        *notes.not_compared(usable),
-        *few,
-    ]
+    warnings = [*checked.notes, *units, *timed.notes, *timed.warnings, *untried, *cut.notes]
+    warnings += [*notes.not_compared(usable), *few]
     own = Settings(screened=24) if robot.mj_model.nv > CUTTING.many else Settings()
     settings = request.settings or (QUICK if request.quick else own)
     return Setup(
         robot=timed.robot,
         physics=physics,
         gate=timed.gate,
-        fitter=Fitter(simulator, base, physics.space.nominal),
+        fitter=fitter,
         candidates=led.candidates,
         scales=size,
         settings=dataclasses.replace(settings, believed=timed.step.believed, budget=budget),

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.quantity import SET_POINT
 from bayessim_mjx.effects.support.site import Site
 
 SOFT = 1e-12  # of inertness, in squared units of time: what is quicker counts as a jump, and 1 / b overflows
@@ -34,10 +35,7 @@ class AccelerationLimit(Effect):
     lacks: ClassVar[str] = "the drive's motion profile"
     separates: ClassVar[str] = "steps of several sizes, small ones among them"
     contains: ClassVar[tuple[str, ...]] = ("rate_limit",)
-    witness: ClassVar[tuple[str, str] | None] = (
-        "effort",
-        "the drive's own set-point, or its measured effort (`effort:<actuator>`)",
-    )
+    witness = SET_POINT
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("slowness", 0.0, 0.0, 2.0, unit="s/ctrl", per="1/command", reach=(0.0, 2.0), grid=(0.0, 0.05)),
         # a unit of the command takes 2 sqrt(inertness) s

@@ -8,6 +8,7 @@ import mujoco
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.actuators import addressed, limits, nonlinear
+from bayessim_mjx.effects.support.quantity import EFFORT_OR_CURRENT
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
@@ -24,10 +25,7 @@ class ActuatorBias(Effect):
     noun: ClassVar[str] = "effort bias"
     lacks: ClassVar[str] = "an effort bias"
     separates: ClassVar[str] = "two mount orientations, or the drive switched off"
-    witness: ClassVar[tuple[str, str] | None] = (
-        "effort",
-        "the drive's measured effort or current (`effort:<actuator>`)",
-    )
+    witness = EFFORT_OR_CURRENT
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("bias", 0.0, -1.0, 1.0, unit="N m", per="force", reach=(-0.5, 0.5)),
     )

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.quantity import EFFORT
 from bayessim_mjx.effects.support.site import Site, ranges
 from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.errors import UserError
@@ -35,7 +36,7 @@ class ActuatorDeadband(Effect):
     noun: ClassVar[str] = "command deadband"
     lacks: ClassVar[str] = "a command deadband"
     separates: ClassVar[str] = "slow ramps and holds with the drive's measured effort in the log"
-    witness: ClassVar[tuple[str, str] | None] = ("effort", "the drive's measured effort (`effort:<actuator>`)")
+    witness = EFFORT
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("half_width", 0.0, 0.0, 0.2, unit="ctrl", per="command", reach=(0.0, 0.3), grid=(0.01, 0.05, 0.2)),
     )

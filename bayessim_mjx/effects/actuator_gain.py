@@ -8,6 +8,7 @@ import mujoco
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.actuators import nonlinear, with_bias
+from bayessim_mjx.effects.support.quantity import EFFORT_OR_CURRENT
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
@@ -26,10 +27,7 @@ class ActuatorGain(Effect):
     separates: ClassVar[str] = (
         "a known added mass, or a force gauge: without a force reference only ratios to inertia show"
     )
-    witness: ClassVar[tuple[str, str] | None] = (
-        "effort",
-        "the drive's measured effort or current (`effort:<actuator>`)",
-    )
+    witness = EFFORT_OR_CURRENT
     quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("gain", 1.0, 0.5, 1.5, grid=(0.1, 0.3, 0.6)),)
 
     def on_actuator(

@@ -9,6 +9,7 @@ import mujoco
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.actuators import addressed, at_rest, follow
+from bayessim_mjx.effects.support.quantity import EFFORT
 from bayessim_mjx.effects.support.site import Site
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ class ActuatorLag(Effect):
     noun: ClassVar[str] = "actuator lag"
     lacks: ClassVar[str] = "an actuator lag"
     separates: ClassVar[str] = "steps and a chirp: a lag is the slope after a step, a delay its dead time"
-    witness: ClassVar[tuple[str, str] | None] = ("effort", "the drive's measured effort (`effort:<actuator>`)")
+    witness = EFFORT
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("time_constant", 0.0, 0.0, 0.2, unit="s", grid=(0.02, 0.1, 0.3)),
     )

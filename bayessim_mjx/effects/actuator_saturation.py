@@ -10,6 +10,7 @@ import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.actuators import addressed, limits
+from bayessim_mjx.effects.support.quantity import EFFORT_OR_CURRENT
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
@@ -33,10 +34,7 @@ class ActuatorSaturation(Effect):
     noun: ClassVar[str] = "effort saturation"
     lacks: ClassVar[str] = "an effort limit"
     separates: ClassVar[str] = "the same motion at several amplitudes, up to the limit"
-    witness: ClassVar[tuple[str, str] | None] = (
-        "effort",
-        "the drive's measured effort or current (`effort:<actuator>`)",
-    )
+    witness = EFFORT_OR_CURRENT
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(
             "inverse_limit",

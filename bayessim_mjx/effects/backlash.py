@@ -1,25 +1,20 @@
 """Backlash: play between motor and link (gear teeth, splines, keys, worn couplings)."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
+from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support import transmission
+from bayessim_mjx.effects.support.quantity import LINK_ENCODER
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
-if TYPE_CHECKING:
-    import mujoco
-    from mujoco import mjx
-
-MARK = 2.0**-40
-
 
 @dataclasses.dataclass(frozen=True)
-class Backlash(Effect):
+class Backlash(transmission.OfTransmission, Effect):
     """The motor turns freely within +-gap around the link; at its ends the teeth push, never pull.
 
     J w_m' = tau - d w_m - s, link moved by s, |q_m - q| <= gap, s = 0 inside. The motor is that of `joint_elasticity`:
@@ -32,28 +27,17 @@ class Backlash(Effect):
 
     name: ClassVar[str] = "backlash"
     kind: ClassVar[str] = "joint"
+    mark: ClassVar[float] = 2.0**-40
     noun: ClassVar[str] = "backlash"
-    follows: ClassVar[bool] = True
     separates: ClassVar[str] = "slow triangles with and without gravity's pre-load, a link-side encoder"
-    witness: ClassVar[tuple[str, str] | None] = ("link", "an encoder on the link side of the gearbox (`link:<joint>`)")
+    witness = LINK_ENCODER
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("gap", 0.0, 0.0, 0.05, unit="rad", per="travel", reach=(0.0, 0.1), grid=(0.03, 0.1, 0.4)),
     )
 
-    def init(self, at: Site) -> Any:
-        return transmission.start(at)
-
-    def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
-        return transmission.split(at, model, self._on(at, theta), MARK)
-
-    def on_actuator(
-        self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
-    ) -> tuple[Any, jax.Array]:
-        return memory, transmission.feedback(at, memory, step, force, self._on(at, theta))
-
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
-        on, gap, fresh = self._on(at, theta), at.values(theta)[:, 0], memory["fresh"]
-        both = transmission.sides(at, memory, step, on, MARK)
+        on, gap, fresh = self.on(at, theta), at.values(theta)[:, 0], memory["fresh"]
+        both = transmission.sides(at, memory, step, on, self.mark)
         none, whole = jnp.zeros(len(at)), jnp.full(len(at), step.dt)
 
         def solve(side: jax.Array) -> transmission.Passed:
@@ -65,15 +49,3 @@ class Backlash(Effect):
         passed = solve(jnp.where(solve(side).torque * side > 0, side, 0.0))
         twist = jnp.where(fresh, gap * jnp.sign(passed.torque), both.twist)
         return transmission.finish(at, step, both, passed, twist)
-
-    def on_record(self, at: Site, memory: Any, before: Measurement, after: Measurement, theta: jax.Array) -> Any:
-        return transmission.recorded(at, memory, before, after, self._on(at, theta))
-
-    def transmits(self, at: Site, theta: jax.Array) -> jax.Array:
-        return at.scatter(jnp.where(self._on(at, theta), 1.0, 0.0)) > 0
-
-    def _on(self, at: Site, theta: jax.Array) -> jax.Array:
-        return at.values(theta)[:, 0] > 0
-
-    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
-        return "MuJoCo needs a body and a joint more for the motor, which changes qpos and qvel; use effects.yaml"

@@ -5,51 +5,35 @@ one has no effect. The impulse is exact: a sub-step applies the time average of 
 """
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support import packets
+from bayessim_mjx.effects.support.packets import Packets
 from bayessim_mjx.effects.support.site import Site
-
-if TYPE_CHECKING:
-    import mujoco
 
 
 @dataclasses.dataclass(frozen=True)
-class CommandPackets(Effect):
+class CommandPackets(Packets):
     """u(t) is the command of the newest message with t_sent + d <= t; d is drawn for each message.
 
     One message serves all actuators where these are tied ("all"); else each has its own. Of one bus with several drives
     that is "all".
 
-    Parameters: `delay`, mean of d, s, neutral 0; `jitter`, its standard deviation, s, neutral 0; `loss`, share of the
-    messages that never arrive, neutral 0.
+    Parameters and `law`: see `Packets`.
 
     Attributes:
-        law: of d: gamma, uniform or two_point (mean +- jitter, one as often as the other).
         lost: hold: the drive goes on with the last command; zero: it takes the command 0 until the next arrives.
     """
 
-    where: str | tuple[str, ...] = "all"
-    law: str = "gamma"
-    lost: str = "hold"
     name: ClassVar[str] = "command_packets"
     kind: ClassVar[str] = "actuator"
-    late: ClassVar[bool] = True
     last: ClassVar[bool] = True
-    random: ClassVar[bool] = True
-    offered: ClassVar[bool] = False
     noun: ClassVar[str] = "varying command delay and loss"
     lacks: ClassVar[str] = "a varying command delay and lost commands"
     separates: ClassVar[str] = "times at which each command was sent and received (`sent:command`, `received:command`)"
-    quantities: ClassVar[tuple[Quantity, ...]] = packets.quantities(0.02)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        packets.check(self.name, self.law, self.lost)
 
     def init(self, at: Site) -> Any:
         """Return the messages of the last control steps, newest last, and what the drives obey; see `on_command`."""
@@ -82,9 +66,6 @@ class CommandPackets(Effect):
         on = jnp.any(values != 0, axis=1)
         memory = {"key": key, "sent": sent, "arrival": arrivals, "obeyed": last, "fresh": jnp.zeros((), bool)}
         return memory, command.at[:, at.ids].set(jnp.where(on, received, own))
-
-    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
-        return "MuJoCo has no messages with random delays; use effects.yaml"
 
 
 def _obeyed(sent: jax.Array, arrival: jax.Array, obeyed: jax.Array, rows: int) -> tuple[jax.Array, jax.Array]:

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.actuators import OfLoops
+from bayessim_mjx.effects.support.quantity import EFFORT_OR_CURRENT
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,8 +27,5 @@ class ControllerDamping(OfLoops, Effect):
     separates: ClassVar[str] = (
         "motion by hand with the drive off: what damps it then is the joint's, not the controller's"
     )
-    witness: ClassVar[tuple[str, str] | None] = (
-        "effort",
-        "the drive's measured effort or current (`effort:<actuator>`)",
-    )
+    witness = EFFORT_OR_CURRENT
     quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("factor", 1.0, 0.0, 10.0, grid=(0.02, 0.1)),)

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.actuators import OfLoops
+from bayessim_mjx.effects.support.quantity import EFFORT_OR_CURRENT
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,8 +25,5 @@ class ControllerStiffness(OfLoops, Effect):
     noun: ClassVar[str] = "wrong controller gain kp"
     lacks: ClassVar[str] = "the true controller gain kp"
     separates: ClassVar[str] = "a known load on the joint at rest: the position error times kp is its torque"
-    witness: ClassVar[tuple[str, str] | None] = (
-        "effort",
-        "the drive's measured effort or current (`effort:<actuator>`)",
-    )
+    witness = EFFORT_OR_CURRENT
     quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("factor", 1.0, 0.1, 10.0, grid=(0.02, 0.1)),)

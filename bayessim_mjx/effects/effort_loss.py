@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.quantity import BUS
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
@@ -33,10 +34,7 @@ class EffortLoss(Effect):
     noun: ClassVar[str] = "effort loss at high load"
     lacks: ClassVar[str] = "an effort loss at high load"
     separates: ClassVar[str] = "the same motion on a full and on an empty battery (or two supply voltages)"
-    witness: ClassVar[tuple[str, str] | None] = (
-        "voltage",
-        "bus voltage and motor current (`voltage`, `current:<actuator>`)",
-    )
+    witness = BUS
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("loss", 0.0, 0.0, 10.0, unit="1/(N m)", per="1/force", reach=(0.0, 1.5), grid=(0.05, 0.2, 0.4, 0.7)),
     )

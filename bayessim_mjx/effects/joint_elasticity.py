@@ -1,25 +1,20 @@
 """Joint elasticity: a spring between motor and link (harmonic drives, belts, long shafts, series elastic actuators)."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
+from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support import transmission
+from bayessim_mjx.effects.support.quantity import LINK_ENCODER
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
-if TYPE_CHECKING:
-    import mujoco
-    from mujoco import mjx
-
-MARK = 2.0**-20
-
 
 @dataclasses.dataclass(frozen=True)
-class JointElasticity(Effect):
+class JointElasticity(transmission.OfTransmission, Effect):
     """J w_m' = tau - d_j w_m - s, link moved by s = k (q_m - q) + d (w_m - w), d = 2 zeta sqrt(k J_s).
 
     The actuators turn the motor, whose inertia J is the joint's armature (taken off the link), or a fifth of what is
@@ -33,11 +28,11 @@ class JointElasticity(Effect):
 
     name: ClassVar[str] = "joint_elasticity"
     kind: ClassVar[str] = "joint"
+    mark: ClassVar[float] = 2.0**-20
     noun: ClassVar[str] = "elastic transmission"
-    follows: ClassVar[bool] = True
     lacks: ClassVar[str] = "an elastic transmission"
     separates: ClassVar[str] = "a chirp beyond the suspected resonance; known static loads with the motor held"
-    witness: ClassVar[tuple[str, str] | None] = ("link", "an encoder on the link side of the gearbox (`link:<joint>`)")
+    witness = LINK_ENCODER
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(
             "compliance", 0.0, 0.0, 0.05, unit="rad/(N m)", per="1/force", reach=(0.0, 0.3), grid=(0.01, 0.03, 0.1, 0.3)
@@ -45,20 +40,9 @@ class JointElasticity(Effect):
         Quantity("damping", 0.1, 0.02, 1.5, grid=(0.05,), shape=True),
     )
 
-    def init(self, at: Site) -> Any:
-        return transmission.start(at)
-
-    def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
-        return transmission.split(at, model, self._on(at, theta), MARK)
-
-    def on_actuator(
-        self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
-    ) -> tuple[Any, jax.Array]:
-        return memory, transmission.feedback(at, memory, step, force, self._on(at, theta))
-
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
-        on = self._on(at, theta)
-        both = transmission.sides(at, memory, step, on, MARK)
+        on = self.on(at, theta)
+        both = transmission.sides(at, memory, step, on, self.mark)
         compliance, ratio = at.values(theta).T
         soft = jnp.where(on & ~memory["fresh"], compliance, 0.0)
         period = jnp.where(on, soft * both.series, 0.0)  # J_s / k
@@ -70,15 +54,3 @@ class JointElasticity(Effect):
         passed = transmission.transmit(both, step.dt, soft, loss, late, jnp.zeros(len(at)), on)
         twist = jnp.where(memory["fresh"], compliance * passed.torque, both.twist)
         return transmission.finish(at, step, both, passed, twist)
-
-    def on_record(self, at: Site, memory: Any, before: Measurement, after: Measurement, theta: jax.Array) -> Any:
-        return transmission.recorded(at, memory, before, after, self._on(at, theta))
-
-    def transmits(self, at: Site, theta: jax.Array) -> jax.Array:
-        return at.scatter(jnp.where(self._on(at, theta), 1.0, 0.0)) > 0
-
-    def _on(self, at: Site, theta: jax.Array) -> jax.Array:
-        return at.values(theta)[:, 0] > 0
-
-    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
-        return "MuJoCo needs a body and a joint more for the motor, which changes qpos and qvel; use effects.yaml"

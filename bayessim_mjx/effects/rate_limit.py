@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.actuators import at_rest, follow
+from bayessim_mjx.effects.support.quantity import SET_POINT
 from bayessim_mjx.effects.support.site import Site
 
 
@@ -29,10 +30,7 @@ class RateLimit(Effect):
     noun: ClassVar[str] = "command rate limit"
     lacks: ClassVar[str] = "a command rate limit"
     separates: ClassVar[str] = "steps of several sizes"
-    witness: ClassVar[tuple[str, str] | None] = (
-        "effort",
-        "the drive's own set-point, or its measured effort (`effort:<actuator>`)",
-    )
+    witness = SET_POINT
     quantities: ClassVar[tuple[Quantity, ...]] = (
         # per the largest command: seconds from 0 to it
         Quantity(

@@ -1,51 +1,36 @@
 """Measurements in messages that arrive after varying times, or are lost: shared buses, radio, bursts of a driver."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
+from bayessim_mjx.effects.effect import Measurement
 from bayessim_mjx.effects.support import packets
 from bayessim_mjx.effects.support.motion import delayed
+from bayessim_mjx.effects.support.packets import Packets
 from bayessim_mjx.effects.support.site import Site, columns, written
-
-if TYPE_CHECKING:
-    import mujoco
 
 
 @dataclasses.dataclass(frozen=True)
-class SensorPackets(Effect):
+class SensorPackets(Packets):
     """measured(t) = q(t - a): the age a is the delay drawn at t, but nothing older is shown than what was shown before.
 
     Between control steps the acceleration is taken as constant, as by `sensor_delay`. One message serves all joints
     where these are tied ("all"); else each has its own.
 
-    Parameters: `delay`, mean of the delay, s, neutral 0; `jitter`, its standard deviation, s, neutral 0; `loss`, share
-    of the measurements that never arrive, neutral 0.
+    Parameters and `law`: see `Packets`.
 
     Attributes:
-        law: of the delay: gamma, uniform or two_point (mean +- jitter, one as often as the other).
         lost: hold: the last measurement stays; zero: positions and velocities read 0.
     """
 
-    where: str | tuple[str, ...] = "all"
-    law: str = "gamma"
-    lost: str = "hold"
     name: ClassVar[str] = "sensor_packets"
     kind: ClassVar[str] = "joint"
-    late: ClassVar[bool] = True
-    random: ClassVar[bool] = True
-    offered: ClassVar[bool] = False
     noun: ClassVar[str] = "varying measurement delay and loss"
     lacks: ClassVar[str] = "a varying measurement delay and lost measurements"
     separates: ClassVar[str] = "times at which each measurement was sent and received (`sent:measurement` ...)"
-    quantities: ClassVar[tuple[Quantity, ...]] = packets.quantities(0.02)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        packets.check(self.name, self.law, self.lost)
 
     def init(self, at: Site) -> Any:
         """Return the measurements `[lag, n, 2]` after past control steps, newest last, and the age of the shown one."""
@@ -72,6 +57,3 @@ class SensorPackets(Effect):
         shown = jnp.where(jnp.any(values != 0, axis=1, keepdims=True), shown, now)
         memory = {"key": key, "history": history, "age": age, "fresh": jnp.zeros((), bool)}
         return memory, written(at, **measurement, values=shown)
-
-    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
-        return "MuJoCo has no messages with random delays; use effects.yaml"

@@ -7,6 +7,7 @@ import mujoco
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.actuators import OfGains, servo
+from bayessim_mjx.effects.support.quantity import EFFORT_OR_CURRENT
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,10 +25,7 @@ class ServoDamping(OfGains, Effect):
     noun: ClassVar[str] = "wrong servo damping (kv)"
     lacks: ClassVar[str] = "the true servo damping (kv)"
     separates: ClassVar[str] = "motion by hand with the drive off: what damps it then is the joint's, not the servo's"
-    witness: ClassVar[tuple[str, str] | None] = (
-        "effort",
-        "the drive's measured effort or current (`effort:<actuator>`)",
-    )
+    witness = EFFORT_OR_CURRENT
     quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("factor", 1.0, 0.0, 10.0, grid=(0.02, 0.1)),)
 
     @classmethod

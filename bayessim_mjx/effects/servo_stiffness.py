@@ -7,6 +7,7 @@ import mujoco
 
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.actuators import OfGains, servo
+from bayessim_mjx.effects.support.quantity import EFFORT_OR_CURRENT
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,10 +25,7 @@ class ServoStiffness(OfGains, Effect):
     noun: ClassVar[str] = "wrong servo stiffness (kp)"
     lacks: ClassVar[str] = "the true servo stiffness (kp)"
     separates: ClassVar[str] = "a known load on the servo at rest: the position error times kp is its torque"
-    witness: ClassVar[tuple[str, str] | None] = (
-        "effort",
-        "the drive's measured effort or current (`effort:<actuator>`)",
-    )
+    witness = EFFORT_OR_CURRENT
     quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("factor", 1.0, 0.1, 10.0, grid=(0.02, 0.1)),)
 
     @classmethod

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.quantity import BUS
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
@@ -32,10 +33,7 @@ class SpeedTorqueLimit(Effect):
     noun: ClassVar[str] = "speed-torque limit"
     lacks: ClassVar[str] = "a speed-torque limit"
     separates: ClassVar[str] = "fast driving and braking"
-    witness: ClassVar[tuple[str, str] | None] = (
-        "voltage",
-        "bus voltage and motor current (`voltage`, `current:<actuator>`)",
-    )
+    witness = BUS
     joint: ClassVar[bool] = True
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(

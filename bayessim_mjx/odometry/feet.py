@@ -13,7 +13,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.odometry.imu import Sensor
 
-ABOVE = 100.0  # m, base height at which nearest points are looked for: no robot reaches the ground there
+ABOVE = 100.0  # m, base height at which nearest points are looked for: no robot is as tall; a rule of thumb
 # Rules of thumb, not counted: the height in m above the lowest point up to which a point rests, without a sensor of
 # contact; of such a sensor the share of its large values from which it is on; and of gravity the specific force below
 # which the robot falls freely.

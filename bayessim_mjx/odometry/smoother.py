@@ -21,7 +21,7 @@ from bayessim_mjx.odometry.feet import Feet
 from bayessim_mjx.odometry.imu import rotation
 
 P, R, V, BG, BA, C = (slice(3 * i, 3 * i + 3) for i in range(6))  # the state's parts; from C on resting points
-SIZE = 15
+SIZE = C.start
 # m and rad, of what nothing measures, at the first row: a choice of the origin, no knowledge. A rule of thumb: smaller
 # ones cost float64 digits
 FIXED = 1e-4

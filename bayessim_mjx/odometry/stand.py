@@ -79,8 +79,8 @@ def welded(model: mujoco.MjModel, body: int) -> Array | None:
 
 SECONDS = 1.0  # of falling until a robot with locked joints rests; contacts settle in hundredths. A rule of thumb
 LOCKED = 1e6  # times its own inertia, of a joint that does not move meanwhile; a rule of thumb
-EVEN = 1e-4  # m, and of the depth at rest the share VARIES, by which depths differ as the load moves; rules of thumb
-VARIES = 0.3
+# By which depths differ as the load moves: m, and share of the depth at rest. Rules of thumb.
+EVEN, VARIES = 1e-4, 0.3
 
 
 def depth(model: mujoco.MjModel, qpos: Array) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from bayessim_mjx import effects as library
 from bayessim_mjx.diagnosis.logcheck import drives, rigid_body
 from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, Mask, Regressor, motion
-from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.support.actuators import OfGains
 from bayessim_mjx.logs.log import Log
-from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
 OWN = ("acceleration", "speed", "dry", "drag", "position", "one", "load", "effort_load")
@@ -107,8 +105,8 @@ class Sums:
         return np.sqrt(np.max([self.power(c) for c in (lay.at("effort"), lay.at("known"), lay.at("load"))], axis=0))
 
 
-def layout_of(model: mujoco.MjModel, loops: Mapping[str, NDArray[np.bool_]]) -> Layout:
-    """Return the columns of a model, and of the controllers that logs declare (`drives.loops_of`)."""
+def layout_of(model: mujoco.MjModel, bodies: int, loops: Mapping[str, NDArray[np.bool_]]) -> Layout:
+    """Return the columns of a model with so many moving bodies; loops: of declared controllers (`drives.loops_of`)."""
     dofs = [drives.dof_of(model, i) for i in range(model.nu)]
     shared = tuple(i for i, dof in enumerate(dofs) if dof is not None and dofs.count(dof) > 1)
     gains = [
@@ -118,7 +116,7 @@ def layout_of(model: mujoco.MjModel, loops: Mapping[str, NDArray[np.bool_]]) -> 
         if dof is not None
         and (loops[kind.loop][i] if kind.loop else issubclass(kind, OfGains) and kind.carries(model, i))
     ]
-    return Layout(len(rigid_body.moving_bodies(model)), model.nv, shared, tuple(gains))
+    return Layout(bodies, model.nv, shared, tuple(gains))
 
 
 def columns(
@@ -143,10 +141,13 @@ def columns(
     for name, column in found.own.items():
         x[:, :, layout.at(name)] = column
     x[:, :, layout.at("effort_load")] = moved.smooth(np.abs(y) * found.dry)
+    factors = [factor if factor != 1.0 else 1.0 + rigid_body.SHIFT for factor in GAINS]  # a derivative at 1
     for k, (name, i) in enumerate(layout.gains):
         dof = drives.dof_of(model, i)
         if dof is not None and source[dof] == "ctrl":  # a measured effort is what the servo gave, whatever its gains
-            for g, more in enumerate(_by_gain(log, model, library.load(name), i, of["ctrl"][:, i]), len(GAINS) * k):
+            for g, more in enumerate(
+                drives.by_gain(log, model, library.load(name), i, of["ctrl"][:, i], factors), len(GAINS) * k
+            ):
                 x[:, dof, layout.at("gain") + g] = moved.filtered(model.actuator_gear[i, 0] * more, log)
     x[:, :, layout.at("effort")], x[:, :, layout.at("late")] = y, np.gradient(y, moved.step, axis=0)
     for i in layout.shared:
@@ -157,26 +158,10 @@ def columns(
     return x, rows, moved.share
 
 
-def _by_gain(log: Log, model: mujoco.MjModel, kind: type[Effect], actuator: int, force: Array) -> Iterator[Array]:
-    """`[T]` of each of GAINS: (force with that multiple of a gain - force) / (multiple - 1); a derivative at 1.
-
-    Without a force limit all are the same.
-    """
-    log, law = drives.centred(log), controllers.read(log.metadata, model, log.actuators, log.name)
-    for factor in GAINS:
-        factor = factor if factor != 1.0 else 1.0 + rigid_body.SHIFT
-        if issubclass(kind, OfGains):
-            moved = drives.commanded(log, kind.scaled(model, actuator, factor))
-        else:
-            gains = getattr(law, kind.loop).at[actuator].multiply(factor)
-            moved = drives.commanded(log, model, law.replace(**{kind.loop: gains}))
-        yield (moved[:, actuator] - force) / (factor - 1.0)
-
-
 def gather(logs: Sequence[Log], model: mujoco.MjModel) -> Sums:
     """Return the sums of logs that move; joints whose effort is not known in all of them are left out."""
     source, loops = drives.sources(logs, model), drives.loops_of(model, logs)
-    layout = layout_of(model, loops)
+    layout = layout_of(model, len(rigid_body.moving_bodies(model)), loops)
     short = shortened(logs)
     top = np.max([np.percentile(np.abs(log.qvel), 95, axis=0) for log in short], axis=0)
     gram, rows = np.zeros((model.nv, layout.size, layout.size)), np.zeros(model.nv)

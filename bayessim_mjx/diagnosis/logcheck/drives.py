@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.effects.support.actuators import OfGains
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.parameters.geometry import tree_mass
 from bayessim_mjx.physics import controllers
@@ -81,6 +83,23 @@ def commanded(log: Log, model: mujoco.MjModel, law: controllers.Law | None = Non
         if model.actuator_forcelimited[i]:
             out[:, i] = np.clip(out[:, i], *model.actuator_forcerange[i])
     return out
+
+
+def by_gain(
+    log: Log, model: mujoco.MjModel, kind: type[Effect], actuator: int, force: Array, factors: Sequence[float]
+) -> Iterator[Array]:
+    """`[T]` of each of `factors`: (force with that multiple of a gain - force) / (multiple - 1).
+
+    Without a force limit all are the same.
+    """
+    log, law = centred(log), controllers.read(log.metadata, model, log.actuators, log.name)
+    for factor in factors:
+        if issubclass(kind, OfGains):
+            moved = commanded(log, kind.scaled(model, actuator, factor))
+        else:
+            gains = getattr(law, kind.loop).at[actuator].multiply(factor)
+            moved = commanded(log, model, law.replace(**{kind.loop: gains}))
+        yield (moved[:, actuator] - force) / (factor - 1.0)
 
 
 def controlled(log: Log, model: mujoco.MjModel) -> Array:

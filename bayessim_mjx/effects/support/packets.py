@@ -1,14 +1,18 @@
 """Messages on a bus that arrive after random times, or never: what is drawn for each, shared by both directions."""
 
+import dataclasses
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.effect import Quantity
+from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.errors import UserError
+
+if TYPE_CHECKING:
+    import mujoco
 
 LAWS = ("gamma", "uniform", "two_point")
 LOST = ("hold", "zero")
@@ -16,24 +20,40 @@ TAIL = 6.0  # sd of a delay beyond its mean that a memory holds: 3e-4 of a gamma
 SLOTS = 256  # messages on the way at once; source: memory of thousands of worlds, a rule of thumb
 
 
-def quantities(high: float) -> tuple[Quantity, ...]:
-    """Return delay, jitter and loss, with ranges up to `high` s and half of all messages."""
-    return (
-        Quantity("delay", 0.0, 0.0, high, unit="s"),
-        Quantity("jitter", 0.0, 0.0, high, unit="s"),
+@dataclasses.dataclass(frozen=True)
+class Packets(Effect):
+    """The settings and parameters of messages in either direction: `command_packets`, `sensor_packets`.
+
+    Parameters: `delay`, mean of the delay d, s, neutral 0; `jitter`, its standard deviation, s, neutral 0; `loss`,
+    share of the messages that never arrive, neutral 0.
+
+    Attributes:
+        law: of d: gamma, uniform or two_point (mean +- jitter, one as often as the other).
+
+    Raises:
+        UserError: naming an unknown law, or `lost`, and what is allowed.
+    """
+
+    where: str | tuple[str, ...] = "all"
+    law: str = "gamma"
+    lost: str = "hold"
+    late: ClassVar[bool] = True
+    random: ClassVar[bool] = True
+    offered: ClassVar[bool] = False
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("delay", 0.0, 0.0, 0.02, unit="s"),
+        Quantity("jitter", 0.0, 0.0, 0.02, unit="s"),
         Quantity("loss", 0.0, 0.0, 0.5, most=1.0),
     )
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for setting, value, allowed in (("law", self.law, LAWS), ("lost", self.lost, LOST)):
+            if value not in allowed:
+                raise UserError(f"{self.name}: {setting} = {value!r}; allowed: {', '.join(allowed)}")
 
-def check(name: str, law: str, lost: str) -> None:
-    """Refuse unknown settings.
-
-    Raises:
-        UserError: naming the setting and what is allowed.
-    """
-    for setting, value, allowed in (("law", law, LAWS), ("lost", lost, LOST)):
-        if value not in allowed:
-            raise UserError(f"{name}: {setting} = {value!r}; allowed: {', '.join(allowed)}")
+    def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
+        return "MuJoCo has no messages with random delays; use effects.yaml"
 
 
 def slots(effect: Any, at: Site) -> int:

@@ -3,6 +3,13 @@
 import dataclasses
 import math
 
+# (stream of a log that shows an effect directly, what to record)
+BUS = ("voltage", "bus voltage and motor current (`voltage`, `current:<actuator>`)")
+EFFORT = ("effort", "the drive's measured effort (`effort:<actuator>`)")
+EFFORT_OR_CURRENT = ("effort", "the drive's measured effort or current (`effort:<actuator>`)")
+LINK_ENCODER = ("link", "an encoder on the link side of the gearbox (`link:<joint>`)")
+SET_POINT = ("effort", "the drive's own set-point, or its measured effort (`effort:<actuator>`)")
+
 STATED = 8.0  # standard deviations of what a data sheet states, in the width of its range
 
 

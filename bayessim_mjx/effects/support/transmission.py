@@ -8,7 +8,7 @@ with the reduction's square count there.
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -221,3 +221,34 @@ def inverse(matrix: jax.Array) -> jax.Array:
         return jnp.where(here[:, None], row, rest)
 
     return 1.0 / matrix if size == 1 else jax.lax.fori_loop(0, size, step, matrix)
+
+
+class OfTransmission:
+    """What effects on a transmission share; `mark`: see `split`; the first parameter is above 0 where there is one."""
+
+    mark: ClassVar[float]
+    follows: ClassVar[bool] = True
+
+    def on(self, at: Site, theta: jax.Array) -> jax.Array:
+        """`[n]` bool, joints that have one."""
+        return at.values(theta)[:, 0] > 0
+
+    def init(self, at: Site) -> Any:
+        return start(at)
+
+    def on_model(self, at: Site, model: "mjx.Model", theta: jax.Array) -> "mjx.Model":
+        return split(at, model, self.on(at, theta), self.mark)
+
+    def on_actuator(
+        self, at: Site, memory: Any, step: SubStep, force: jax.Array, theta: jax.Array
+    ) -> tuple[Any, jax.Array]:
+        return memory, feedback(at, memory, step, force, self.on(at, theta))
+
+    def on_record(self, at: Site, memory: Any, before: Any, after: Any, theta: jax.Array) -> Any:
+        return recorded(at, memory, before, after, self.on(at, theta))
+
+    def transmits(self, at: Site, theta: jax.Array) -> jax.Array:
+        return at.scatter(jnp.where(self.on(at, theta), 1.0, 0.0)) > 0
+
+    def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
+        return "MuJoCo needs a body and a joint more for the motor, which changes qpos and qvel; use effects.yaml"
