@@ -15,9 +15,9 @@ from bayessim_mjx.diagnosis.residual.black_boxes import Flexible
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance
 from bayessim_mjx.diagnosis.residual.frequency import Heard
 from bayessim_mjx.diagnosis.residual.where import Located
-from bayessim_mjx.diagnosis.selection.budget import Budget, Progress
 from bayessim_mjx.diagnosis.selection.heldout import Prediction
 from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.numbers import Budget, Progress
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.setup import Setup
 

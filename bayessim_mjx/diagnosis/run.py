@@ -29,9 +29,9 @@ from bayessim_mjx.diagnosis.residual import black_boxes, frequency, where
 from bayessim_mjx.diagnosis.residual.black_boxes import Flexible, flexible
 from bayessim_mjx.diagnosis.residual.disturbance import Disturbance, estimate
 from bayessim_mjx.diagnosis.result import Diagnosis
-from bayessim_mjx.diagnosis.selection import budget, heldout
-from bayessim_mjx.diagnosis.selection.budget import Progress
+from bayessim_mjx.diagnosis.selection import heldout, numbers
 from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.numbers import Progress
 from bayessim_mjx.diagnosis.setup import Setup, prepare
 from bayessim_mjx.diagnosis.summary import again
 from bayessim_mjx.diagnosis.summary.files import Files, header
@@ -117,7 +117,7 @@ def investigate(
         UserError: nothing usable. TooLittleData: nothing could be held out.
     """
     observer.progress("looking at the logs", 0, 1)
-    time_left = budget.begun(request.minutes)
+    time_left = numbers.begun(request.minutes)
     setup = prepare(robot, logs, request, time_left, lambda look: observer.early(notes.first_look(look)))
     setup = remembering(setup, request.remember)
     for text in setup.said:
@@ -215,7 +215,7 @@ def _asked(setup: Setup) -> tuple[str, str]:
     arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(windows.batch)]
     arrays += [windows.group, windows.sigma_q, windows.sigma_v, windows.spread, fitter.theta, raw]
     each = [(c.label, c.coordinates, c.shapes, c.probes.tobytes()) for c in setup.candidates]
-    every = replace(setup.settings, budget=budget.Budget())
+    every = replace(setup.settings, budget=numbers.Budget())
     code = versions.sources(), sorted({str(programs.source_of(type(e))) for e in setup.physics.effects})
     question = *arrays, fitter.base, each, every, simulator.lanes, jax.default_backend(), versions.versions()
     return digest(*question), digest(*code)

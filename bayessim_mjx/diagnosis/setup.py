@@ -29,7 +29,7 @@ from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck import gate, noise
 from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.diagnosis.request import Request, Tolerance, tolerances
-from bayessim_mjx.diagnosis.selection.budget import Budget
+from bayessim_mjx.diagnosis.selection.numbers import Budget
 from bayessim_mjx.diagnosis.selection.search_state import Settings
 from bayessim_mjx.effects.support.motion import AROUND
 from bayessim_mjx.logs.log import Log

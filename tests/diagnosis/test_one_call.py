@@ -20,7 +20,7 @@ from bayessim_mjx.diagnosis.findings import Findings, Observer, Where, carry_out
 from bayessim_mjx.diagnosis.fitting.cutting import TooLittleData
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.residual.where import Located
-from bayessim_mjx.diagnosis.selection.budget import Budget
+from bayessim_mjx.diagnosis.selection.numbers import Budget
 from bayessim_mjx.errors import UserError
 from tests.diagnosis.pendulums import MODEL, nominal, recorded, saved
 from tests.report import fake

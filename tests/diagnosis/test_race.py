@@ -11,7 +11,7 @@ from bayessim_mjx.diagnosis.evidence import selecting
 from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.request import Request
 from bayessim_mjx.diagnosis.selection import successive_halving
-from bayessim_mjx.diagnosis.selection.budget import Budget
+from bayessim_mjx.diagnosis.selection.numbers import Budget
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.diagnosis.summary.assemble import not_fitted, not_tried
 

@@ -7,7 +7,7 @@ from types import MappingProxyType
 import pytest
 
 from bayessim_mjx.diagnosis.findings import Findings, Observer, Stage, carry_out
-from bayessim_mjx.diagnosis.selection.budget import Budget
+from bayessim_mjx.diagnosis.selection.numbers import Budget
 
 
 class First:

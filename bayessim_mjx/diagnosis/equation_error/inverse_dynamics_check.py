@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.equation_error import fit as fitting
 from bayessim_mjx.diagnosis.equation_error import sums as summing
 from bayessim_mjx.diagnosis.equation_error import terms
-from bayessim_mjx.diagnosis.equation_error.closed_loops import OfModel
 from bayessim_mjx.diagnosis.equation_error.fit import Fit, Term
-from bayessim_mjx.diagnosis.equation_error.search import STRONG, Found, Proposal, contradicted, described
+from bayessim_mjx.diagnosis.equation_error.search import STRONG, Found, OfModel, Proposal, contradicted, described
 from bayessim_mjx.diagnosis.equation_error.sums import Sums
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, base_coordinates
 from bayessim_mjx.diagnosis.fitting.robot import Robot

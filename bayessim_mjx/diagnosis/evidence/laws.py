@@ -29,9 +29,8 @@ from bayessim_mjx.diagnosis.data_sheet import SURE
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial
-from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model
-from bayessim_mjx.diagnosis.selection.numbers import EFFORT, HIDDEN, ODDS
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, HIDDEN, ODDS, Progress
 from bayessim_mjx.diagnosis.selection.screen import Column, Projection, Screened, judged, looked_at, part, simulated
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.effects import load, names

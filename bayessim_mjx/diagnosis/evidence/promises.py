@@ -20,9 +20,8 @@ from bayessim_mjx.diagnosis.evidence.laws import beside
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.evidence.weighing import Weighing
 from bayessim_mjx.diagnosis.fitting.fit import Fit
-from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Key
-from bayessim_mjx.diagnosis.selection.numbers import EFFORT, PRIORS
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, PRIORS, Progress
 from bayessim_mjx.diagnosis.selection.screen import Column, looked_at, simulated
 
 Array = NDArray[np.float64]

@@ -27,9 +27,8 @@ from bayessim_mjx.diagnosis.evidence.weighing import Weighed, Weighing
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection.bounds import widened
-from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, SINGLES, TOGETHER, Progress
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
-from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, LEAVING_OUT, ODDS, SINGLES, TOGETHER, Progress
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.selection.successive_halving import Entries, cut_back, fit_entries, polish
 

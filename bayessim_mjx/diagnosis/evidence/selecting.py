@@ -19,8 +19,8 @@ from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate, solve
 from bayessim_mjx.diagnosis.phrases import effects as phrases
-from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model
+from bayessim_mjx.diagnosis.selection.numbers import LEAVING_OUT, Progress
 from bayessim_mjx.diagnosis.selection.screen import Column
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings
 from bayessim_mjx.diagnosis.selection.successive_halving import Entries, begin, cut_back, fit_entries

@@ -19,9 +19,8 @@ from bayessim_mjx.diagnosis.experiment.rehearsal import Played, Rehearsal
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.phrases import advice as phrases
 from bayessim_mjx.diagnosis.phrases.effects import all_of
-from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model, nats
-from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, Progress
 from bayessim_mjx.diagnosis.selection.search_state import ranked
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.effects.support.bodies import tilted

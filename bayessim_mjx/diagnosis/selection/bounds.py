@@ -11,9 +11,8 @@ import numpy as np
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate, shrink
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
-from bayessim_mjx.diagnosis.selection.budget import LEAVING_OUT, Progress
 from bayessim_mjx.diagnosis.selection.models import Model, nats, scored
-from bayessim_mjx.diagnosis.selection.numbers import ODDS, PRIORS
+from bayessim_mjx.diagnosis.selection.numbers import LEAVING_OUT, ODDS, PRIORS, Progress
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.selection.successive_halving import AFRESH
 from bayessim_mjx.physics import Physics

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.selection.budget import Progress
-from bayessim_mjx.diagnosis.selection.numbers import EFFORT
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, Progress
 from bayessim_mjx.diagnosis.statistics import times
 
 Array = NDArray[np.float64]

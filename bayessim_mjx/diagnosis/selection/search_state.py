@@ -10,9 +10,8 @@ import numpy as np
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.robot import contacts
-from bayessim_mjx.diagnosis.selection.budget import Budget
 from bayessim_mjx.diagnosis.selection.models import Key, Model
-from bayessim_mjx.diagnosis.selection.numbers import EFFORT, FLOOR, PRIORS
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT, FLOOR, PRIORS, Budget
 from bayessim_mjx.diagnosis.selection.screen import Screened, Secants
 from bayessim_mjx.diagnosis.statistics import Gap
 

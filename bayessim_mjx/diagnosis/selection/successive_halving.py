@@ -22,9 +22,17 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.journal import Remembering
-from bayessim_mjx.diagnosis.selection.budget import KNOWN, LEAVING_OUT, SCREENING, SINGLES, Progress
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
-from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, RELEVANCE
+from bayessim_mjx.diagnosis.selection.numbers import (
+    EFFORT,
+    KNOWN,
+    LEAVING_OUT,
+    ODDS,
+    RELEVANCE,
+    SCREENING,
+    SINGLES,
+    Progress,
+)
 from bayessim_mjx.diagnosis.selection.screen import looked_at, part, screen
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings
 

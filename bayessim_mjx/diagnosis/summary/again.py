@@ -23,8 +23,8 @@ from bayessim_mjx.diagnosis.fitting.robot import contacts
 from bayessim_mjx.diagnosis.fitting.simulator import FAR, Simulator, physics_of
 from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.diagnosis.request import Tolerance
-from bayessim_mjx.diagnosis.selection.budget import Progress
 from bayessim_mjx.diagnosis.selection.models import Model, of_noise, systematic
+from bayessim_mjx.diagnosis.selection.numbers import Progress
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.physics import Physics, staggered
 

@@ -19,9 +19,8 @@ from bayessim_mjx.diagnosis.request import length_unit
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
 from bayessim_mjx.diagnosis.selection import bounds
-from bayessim_mjx.diagnosis.selection.budget import SINGLES
 from bayessim_mjx.diagnosis.selection.models import BASE, systematic
-from bayessim_mjx.diagnosis.selection.numbers import HIDDEN
+from bayessim_mjx.diagnosis.selection.numbers import HIDDEN, SINGLES
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, ranked
 from bayessim_mjx.diagnosis.summary import estimates, how_far
 from bayessim_mjx.diagnosis.summary.again import AtFinerSteps, Whole

@@ -22,7 +22,7 @@ from bayessim_mjx.diagnosis.fitting import journal
 from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, one_line
 from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.diagnosis.result import Diagnosis, load, plain
-from bayessim_mjx.diagnosis.selection.budget import Progress
+from bayessim_mjx.diagnosis.selection.numbers import Progress
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.diagnosis.statistics import of_one

@@ -9,7 +9,7 @@ import pytest
 from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.phrases import verdict
 from bayessim_mjx.diagnosis.selection import successive_halving
-from bayessim_mjx.diagnosis.selection.budget import ENDS, Budget, begun
+from bayessim_mjx.diagnosis.selection.numbers import ENDS, Budget, begun
 from bayessim_mjx.diagnosis.selection.search_state import Settings
 from bayessim_mjx.diagnosis.summary.assemble import not_fitted, not_tried
 
