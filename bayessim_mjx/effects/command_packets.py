@@ -10,19 +10,21 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
+from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.support import packets
 from bayessim_mjx.effects.support.packets import Packets
 from bayessim_mjx.effects.support.site import Site
 
 
 @dataclasses.dataclass(frozen=True)
-class CommandPackets(Packets):
+class CommandPackets(Packets, Effect):
     """u(t) is the command of the newest message with t_sent + d <= t; d is drawn for each message.
 
     One message serves all actuators where these are tied ("all"); else each has its own. Of one bus with several drives
     that is "all".
 
-    Parameters and `law`: see `Packets`.
+    Parameters: `delay`, mean of d, s, neutral 0; `jitter`, its standard deviation, s, neutral 0; `loss`, share of the
+    messages that never arrive, neutral 0. `law`: see `Packets`.
 
     Attributes:
         lost: hold: the drive goes on with the last command; zero: it takes the command 0 until the next arrives.

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.effect import Measurement
+from bayessim_mjx.effects.effect import Effect, Measurement
 from bayessim_mjx.effects.support import packets
 from bayessim_mjx.effects.support.motion import delayed
 from bayessim_mjx.effects.support.packets import Packets
@@ -14,13 +14,14 @@ from bayessim_mjx.effects.support.site import Site, columns, written
 
 
 @dataclasses.dataclass(frozen=True)
-class SensorPackets(Packets):
+class SensorPackets(Packets, Effect):
     """measured(t) = q(t - a): the age a is the delay drawn at t, but nothing older is shown than what was shown before.
 
     Between control steps the acceleration is taken as constant, as by `sensor_delay`. One message serves all joints
     where these are tied ("all"); else each has its own.
 
-    Parameters and `law`: see `Packets`.
+    Parameters: `delay`, mean of the delay, s, neutral 0; `jitter`, its standard deviation, s, neutral 0; `loss`, share
+    of the measurements that never arrive, neutral 0. `law`: see `Packets`.
 
     Attributes:
         lost: hold: the last measurement stays; zero: positions and velocities read 0.

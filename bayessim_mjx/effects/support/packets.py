@@ -24,11 +24,8 @@ SLOTS = 256  # messages on the way at once; source: memory of thousands of world
 class Packets(Effect):
     """The settings and parameters of messages in either direction: `command_packets`, `sensor_packets`.
 
-    Parameters: `delay`, mean of the delay d, s, neutral 0; `jitter`, its standard deviation, s, neutral 0; `loss`,
-    share of the messages that never arrive, neutral 0.
-
     Attributes:
-        law: of d: gamma, uniform or two_point (mean +- jitter, one as often as the other).
+        law: of the delay: gamma, uniform or two_point (mean +- jitter, one as often as the other).
 
     Raises:
         UserError: naming an unknown law, or `lost`, and what is allowed.
