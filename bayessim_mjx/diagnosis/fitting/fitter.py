@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.fitting import quadratic
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit, broyden, settled
-from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Rest, blocks, held_out, predictive, solve, weights
+from bayessim_mjx.diagnosis.fitting.quadratic import blocks, held_out, solve, weights
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 
 __all__ = ["Fit", "Fitter", "weights"]
@@ -136,7 +136,7 @@ class Fitter:
         moved = np.concatenate([np.repeat(fit.offsets[None], k, 0), fit.offsets[None] + (np.eye(s) * h)[:, None, :]])
         r = self.whiten(self.simulator.run(np.stack(thetas), moved))
         A, B = quadratic.columns(fit.r, r[:k], steps), quadratic.columns(fit.r, r[k:], h)
-        return replace(fit, A=A, B=B, history=(*fit.history, fit.cost))
+        return replace(fit, A=A, B=B, history=(*fit.history, fit.cost), damping=Fit.damping, reach=np.ones(1))
 
     def cost(self, fit: Fit, r: Array, offsets: Array, values: Array) -> float:
         """Of data and priors. Those of stated parameters belong to errors of unknown size: data * exp(prior / numbers).
@@ -285,31 +285,6 @@ class Fitter:
         split = functools.partial(blocks, q, starts, fit.r, fit.A)
         return held_out(q, group, fit.weight, precision, pull, low, high, watched, split)
 
-    def innovations(self, fit: Fit, moves: Array, estimates: Array, plain: Array, at: Quadratic | None = None) -> Array:
-        """Held-out costs `[W]` with the uncertainty of the estimates that they were predicted with.
-
-        Conditions that alone tell a parameter count as they were predicted: without them nothing is known of it.
-
-        Args:
-            moves: `[G, k]`, to the estimates without a condition from where the costs `at` are those of.
-            estimates: `[G, k]`; plain: `[W]`, costs of the predictions themselves.
-            at: costs about points of the parameters; None: about the fit.
-        """
-        rest, tells = _rest(fit, self.spread, len(self.base))
-        q, costs, group = rest.q if at is None else at, plain.copy(), self.simulator.windows.group
-        for name, move, estimate in zip(np.unique(group), moves, estimates, strict=True):
-            own, point = group == name, estimate - move - fit.values
-            if not tells(own):
-                H = rest.curvature(own)[1]
-                costs[own] = predictive(q, own, fit.weight, move, H, rest.low - point, rest.high - point)
-        return costs
-
-    def told_alone(self, fit: Fit) -> list[bool]:
-        """Of each condition, whether it alone tells a parameter of an effect (a limit that is reached there only)."""
-        _, tells = _rest(fit, self.spread, len(self.base))
-        group = self.simulator.windows.group
-        return [tells(group == name) for name in np.unique(group)]
-
 
 def _scale(fit: Fit, S: Array) -> Array:
     """`[k]`, what a unit of damping adds to the curvatures: their own, and a share of the largest in units of ranges.
@@ -320,9 +295,3 @@ def _scale(fit: Fit, S: Array) -> Array:
     own = np.diag(S)
     width = np.array([c.high - c.low for c in fit.coordinates])
     return np.asarray(own + DAMPED * np.max(own * width**2, initial=0.0) / width**2)
-
-
-def _rest(fit: Fit, spread: Array, base: int) -> tuple[Rest, Callable[[NDArray[np.bool_]], bool]]:
-    """Fits without some windows, and whether some alone tell a parameter of an effect: one behind the first `base`."""
-    rest = Rest(fit.quadratic(spread)[0], fit.weight, *fit.prior())
-    return rest, rest.told_by(np.arange(base, len(fit.coordinates)))

@@ -87,7 +87,7 @@ class SuccessiveHalving:
 
 
 def _behind(made: int) -> float:
-    """Times the best cost that a start may have after so many steps."""
+    """Return how many times the best cost a start may have after so many steps."""
     return 1.0 + (EFFORT.close - 1.0) / EFFORT.close ** (made - 1)
 
 
@@ -162,6 +162,7 @@ def _fit_batch(
         state.vain |= set(entries) - set(gaining)
         again = [back(first[key][1], best[key], own) for key in gaining]
         found = state.fitter.iterate(again, state.settings.iterations, *rules, None, finals.finals()) if again else []
+        finals.learn(found)
         best = dict(zip(gaining, found, strict=True))
     for key, fit in best.items():
         state.models[key] = scored(state.fitter, fit, entries[key][1])
