@@ -212,7 +212,7 @@ class Fitter:
         """
         apart = getattr(self.simulator, "apart", False)
         found = self._simulated(fits, {i: (*trial[i], () if apart else which) for i, which in asked.items()})
-        tried = {i: self._trial(fits[i], *trial[i], *parts) for i, parts in found.items()}
+        tried = {i: self._trial(fits[i], trial[i], parts) for i, parts in found.items()}
         new = {i: (*trial[i], asked[i]) for i, one in tried.items() if apart and one.better and not one.predicted}
         for i, (moved, which, steps) in self._simulated(fits, new, alone=True).items():
             tried[i] = replace(tried[i], which=which, columns=quadratic.columns(tried[i].r, moved, steps))
@@ -240,8 +240,9 @@ class Fitter:
         parts = np.split(r, np.cumsum(sizes)[:-1])
         return {i: (part, points[i][2], steps[i]) for i, part in zip(points, parts, strict=True)}
 
-    def _trial(self, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int], steps: Array) -> Trial:
+    def _trial(self, fit: Fit, point: tuple[Array, Array], found: tuple[Array, Sequence[int], Array]) -> Trial:
         """Judge a trial point by its residuals (`r[0]`); the others are at shifted values."""
+        (values, x), (r, which, steps) = point, found
         cost = self.cost(fit, r[0], x, values)
         gain, new = fit.cost - cost, not np.isfinite(fit.cost)
         columns = quadratic.columns(r[0], r[1:], steps) if gain > 0 or new else r[:0]

@@ -51,7 +51,9 @@ def test_a_payload_is_found_from_any_start_in_a_few_steps(start):
     assert fit.cost < 1.5 * TIMES.size
 
 
-@pytest.mark.parametrize(("arm", "start", "known"), [(0.8, 0.3, 0.4), (0.8, 0.3, 0.7), (0.8, 0.6, 0.4), (0.4, 0.6, 0.4)])
+@pytest.mark.parametrize(
+    ("arm", "start", "known"), [(0.8, 0.3, 0.4), (0.8, 0.3, 0.7), (0.8, 0.6, 0.4), (0.4, 0.6, 0.4)]
+)
 def test_old_columns_are_differenced_anew_where_they_led_astray(arm, start, known):
     """As in a search, steps ask for an effect's column alone; the others' are of the model without it.
 
