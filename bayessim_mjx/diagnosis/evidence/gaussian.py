@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dtrtri
 from scipy.optimize import minimize
 
 from bayessim_mjx.diagnosis.fitting.quadratic import solve
@@ -113,7 +114,7 @@ def marginal(windows: Windows, hyper: Hyper) -> Marginal:
     inner = root.T @ gram[:, own:, own:] @ root + np.eye(size)
     rounding = np.finfo(np.float64).eps * np.diagonal(inner, axis1=1, axis2=2)[..., None]
     lower = np.linalg.cholesky(inner + rounding * np.eye(size))
-    back = np.asarray(np.linalg.inv(lower), np.float64)
+    back = np.stack([dtrtri(one, lower=1)[0] for one in lower])
     half = back @ VY  # squared it is subtracted: an inverse of `inner` there would lose all digits of large residuals
     logdet = 2 * np.sum(np.log(np.diagonal(lower, axis1=1, axis2=2)), 1)
     logdet += 2 * windows.rows * float(np.sum(np.log(hyper.noise)))

@@ -159,8 +159,10 @@ class Search:
             self._fit([Plan(key, np.inf, parent) for key, parent in fewer.items()], "dropping", LEAVING_OUT)
 
     def _finish(self) -> None:
-        """Bring the fits of the finalists to their end."""
-        some = [k for k in self._order()[: EFFORT.sets[0]] if k and k not in self._polished]
+        """Bring the fits of the finalists to their end: of sets that may be the answer (`Effort.margin`)."""
+        total = {k: self.weighing.total(k) for k in self._order()[: EFFORT.sets[0]]}
+        near = [k for k, nats in total.items() if nats > max(total.values()) - EFFORT.margin]
+        some = [k for k in near if k and k not in self._polished]
         if some and not self.state.settings.budget.over(LEAVING_OUT):
             polish(self.state, [self.state.models[k] for k in some], self.say)
             self._polished |= set(some)

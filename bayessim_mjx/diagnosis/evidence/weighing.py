@@ -199,19 +199,22 @@ class Weighing:
     def without(self, condition: int) -> Weighed:
         """Return the posterior given all windows but those of one operating condition, by the same hyperparameters."""
         kept = self.state.fitter.simulator.windows.group != condition
-        return self._weighed({k: _without(s, kept) for k, s in self.scored.items()})
+        rough = {k: _without(s, kept, sizes=False) for k, s in self.scored.items()}
+        total = {k: nats + self.state.log_prior(k) for k, nats in rough.items()}
+        near = [k for k in rough if k == BASE or total[k] > max(total.values()) - EFFORT.margin]
+        return self._weighed(rough | {k: _without(self.scored[k], kept) for k in near})
 
     def _weighed(self, nats: dict[Key, float]) -> Weighed:
         numbers = {k: sum(len(e.coordinates) for e in s.model.effects) for k, s in self.scored.items()}
         return weighed(nats, self.excess(self.scored), numbers, len(self.state.candidates))
 
 
-def _without(of: Scored, kept: NDArray[np.bool_]) -> float:
-    """Evidence given some of the windows alone, with the same hyperparameters."""
+def _without(of: Scored, kept: NDArray[np.bool_], sizes: bool = True) -> float:
+    """Evidence given some of the windows alone, with the same hyperparameters; sizes: of effects summed over."""
     there = of.learnt.marginal
     some = replace(there, Q=there.Q[kept], logdet=there.logdet[kept], cov=there.cov[kept], mean=there.mean[kept])
     learnt = replace(of.learnt, marginal=some, step=belief_of(of.fit).best(some.Q.sum(0)))
-    return integrated(of.fit, learnt, _numbers(of.model)).nats
+    return integrated(of.fit, learnt, _numbers(of.model) if sizes else ()).nats
 
 
 def _numbers(model: Model) -> list[dict[int, bool]]:

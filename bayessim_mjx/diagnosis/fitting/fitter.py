@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.fitting import quadratic
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import Fit, broyden, settled
-from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, Rest, blocks, held_out, predictive, solve, weights
+from bayessim_mjx.diagnosis.fitting.quadratic import blocks, held_out, solve, weights
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
 
 __all__ = ["Fit", "Fitter", "weights"]
@@ -26,6 +26,29 @@ Array = NDArray[np.float64]
 # and 1, from four far starts of a payload and a bias, 2, 2, 4, 2, 3, 4 and 3 arrive; 1 finds no limit beside play
 DAMPED = 0.01
 NUMBERS = 2  # independent ones that a window's channel holds: a missing force is a smooth curve; a rule of thumb
+# Share of the promised gain from which on a step shows that its columns hold (Fletcher, Practical Methods of
+# Optimization, 1987, sec. 5.1)
+TRUSTED = 0.75
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A point that a fit tried.
+
+    Attributes:
+        values: `[k]`; offsets: `[W, s]`; r: `[W, n]`, residuals; cost.
+        better: whether it is better than where the fit is; predicted: whether it gains what the columns promised.
+        which: columns that were differenced anew; columns: `[W, n, k]`, at this point, or where the fit stays there.
+    """
+
+    values: Array
+    offsets: Array
+    r: Array
+    cost: float
+    better: bool
+    predicted: bool
+    which: Sequence[int]
+    columns: Array
 
 
 class Fitter:
@@ -79,7 +102,7 @@ class Fitter:
         h = quadratic.RULES.change * self.spread
         moved = offsets[None] + (np.eye(s) * h)[:, None, :]
         shifted = self.whiten(self.simulator.run(np.repeat(theta[None], s, 0), moved))
-        return np.ascontiguousarray(np.moveaxis((r[None] - shifted) / h[:, None, None], 0, -1))
+        return quadratic.columns(r, shifted, h)
 
     def begin(
         self, coordinates: Sequence[Coordinate], values: Array | None = None, offsets: Array | None = None
@@ -104,6 +127,16 @@ class Fitter:
         new = replace(fit, r=r[0], A=A, B=B, weight=weights(r[0]) * self.measured)
         new = replace(new, doubt=self._doubt(self._data(new, new.r, new.offsets)))
         return replace(new, cost=self.cost(new, new.r, new.offsets, new.values))
+
+    def anew(self, fit: Fit) -> Fit:
+        """All columns anew where the fit is, by one-sided differences: a step that is refused needs no better ones."""
+        theta, k, s = self.vector(fit.coordinates, fit.values), len(fit.values), len(self.spread)
+        steps, h = fit.inward(fit.values, fit.steps()), quadratic.RULES.change * self.spread
+        thetas = [*self._shifts(fit, fit.values, range(k), steps), *[theta] * s]
+        moved = np.concatenate([np.repeat(fit.offsets[None], k, 0), fit.offsets[None] + (np.eye(s) * h)[:, None, :]])
+        r = self.whiten(self.simulator.run(np.stack(thetas), moved))
+        A, B = quadratic.columns(fit.r, r[:k], steps), quadratic.columns(fit.r, r[k:], h)
+        return replace(fit, A=A, B=B, history=(*fit.history, fit.cost), damping=Fit.damping, reach=np.ones(1))
 
     def cost(self, fit: Fit, r: Array, offsets: Array, values: Array) -> float:
         """Of data and priors. Those of stated parameters belong to errors of unknown size: data * exp(prior / numbers).
@@ -151,12 +184,15 @@ class Fitter:
         """
         now, trial = list(fits), [(f.values, f.offsets) for f in fits]
         running: Sequence[int] = range(len(now))
+        old = {i for i in running if not np.isfinite(now[i].cost)}  # fits with columns of a point before
         for made in range(iterations + 1):
             if not running:
                 return now
             asked = {i: list(fresh(now[i])) for i in running}
-            for i, (own, steps) in self._tried(now, trial, asked).items():
-                now[i] = self._stepped(now[i], *trial[i], own, asked[i], steps)
+            for i, tried in self._tried(now, trial, asked).items():
+                astray = i in old and not tried.better
+                now[i] = self.anew(now[i]) if astray else self._stepped(now[i], tried)
+                old = old - {i} if astray else old | {i} if tried.better else old
                 now[i], trial[i] = self._propose(now[i])
             running = [i for i in running if not settled(now[i], tolerance)]
             running = running if keep is None else keep(made, now, running)
@@ -166,32 +202,32 @@ class Fitter:
 
     def _tried(
         self, fits: Sequence[Fit], trial: Sequence[tuple[Array, Array]], asked: Mapping[int, Sequence[int]]
-    ) -> dict[int, tuple[Array, Array]]:
-        """{fit: (residuals at its trial point and at those shifted for the columns asked for, the shifts)}.
+    ) -> dict[int, Trial]:
+        """Simulate trial points, and columns at better ones that old columns did not predict.
 
-        Where each world costs as much in a small call as in a large one, shifted ones are simulated after the others,
-        of points that are better alone.
+        An accelerator simulates both in one call. On a CPU each world costs as much in a small call as in a large one.
+
+        Args:
+            asked: {fit: columns that are differenced anew}.
         """
         apart = getattr(self.simulator, "apart", False)
-        first: dict[int, Sequence[int]] = {i: () for i in asked} if apart else dict(asked)
-        found = self._shifted(fits, trial, first)
-        if apart:
-            better = {i: asked[i] for i, (r, _) in found.items() if self._better(fits[i], r[0], *trial[i])[0]}
-            more = self._shifted(fits, trial, better, alone=True)
-            found |= {i: (np.concatenate([found[i][0], r]), steps) for i, (r, steps) in more.items()}
-        return found
+        found = self._simulated(fits, {i: (*trial[i], () if apart else which) for i, which in asked.items()})
+        tried = {i: self._trial(fits[i], trial[i], parts) for i, parts in found.items()}
+        new = {i: (*trial[i], asked[i]) for i, one in tried.items() if apart and one.better and not one.predicted}
+        for i, (moved, which, steps) in self._simulated(fits, new, alone=True).items():
+            tried[i] = replace(tried[i], which=which, columns=quadratic.columns(tried[i].r, moved, steps))
+        return tried
 
-    def _shifted(
-        self,
-        fits: Sequence[Fit],
-        trial: Sequence[tuple[Array, Array]],
-        asked: Mapping[int, Sequence[int]],
-        alone: bool = False,
-    ) -> dict[int, tuple[Array, Array]]:
-        """Return `_tried` in one call; alone: without the trial points themselves."""
+    def _simulated(
+        self, fits: Sequence[Fit], points: Mapping[int, tuple[Array, Array, Sequence[int]]], alone: bool = False
+    ) -> dict[int, tuple[Array, Sequence[int], Array]]:
+        """{fit: (residuals, columns, their steps)} in one call: of points and shifted ones; alone: of those only.
+
+        Args:
+            points: {fit: (values, offsets, columns that are differenced there)}.
+        """
         thetas, offsets, sizes, steps = [], [], [], {}
-        for i, which in asked.items():
-            values, x = trial[i]
+        for i, (values, x, which) in points.items():
             moves = fits[i].inward(values, fits[i].usual)
             shifted, steps[i] = self._shifts(fits[i], values, which, moves), moves[list(which)]
             own = shifted if alone else [self.vector(fits[i].coordinates, values), *shifted]
@@ -202,27 +238,29 @@ class Fitter:
             return {}
         r = self.whiten(self.simulator.run(np.stack(thetas), np.stack(offsets)))
         parts = np.split(r, np.cumsum(sizes)[:-1])
-        return {i: (part, steps[i]) for i, part in zip(asked, parts, strict=True)}
+        return {i: (part, points[i][2], steps[i]) for i, part in zip(points, parts, strict=True)}
 
-    def _better(self, fit: Fit, r: Array, values: Array, x: Array) -> tuple[bool, float]:
-        """Whether a trial point is better than where the fit is, and its cost."""
-        cost = self.cost(fit, r, x, values)
-        return cost < fit.cost or not np.isfinite(fit.cost), cost
+    def _trial(self, fit: Fit, point: tuple[Array, Array], found: tuple[Array, Sequence[int], Array]) -> Trial:
+        """Judge a trial point by its residuals (`r[0]`); the others are at shifted values."""
+        (values, x), (r, which, steps) = point, found
+        cost = self.cost(fit, r[0], x, values)
+        gain, new = fit.cost - cost, not np.isfinite(fit.cost)
+        columns = quadratic.columns(r[0], r[1:], steps) if gain > 0 or new else r[:0]
+        return Trial(values, x, r[0], cost, gain > 0 or new, not new and gain > TRUSTED * fit.promise, which, columns)
 
-    def _stepped(self, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int], steps: Array) -> Fit:
+    def _stepped(self, fit: Fit, tried: Trial) -> Fit:
         """Return the fit at a trial point where that is better, else more damped where it was."""
-        better, cost = self._better(fit, r[0], values, x)
-        if better:
+        if tried.better:
             A = fit.A.copy()
-            if np.isfinite(fit.cost) and len(which) < len(fit.coordinates):
-                broyden(A, fit, values, x, r[0], which)
-            A[:, :, which] = quadratic.columns(r[0], r[1:], steps)
-            doubt = self._doubt(self._data(fit, r[0], x))
-            fit = replace(fit, values=values, offsets=x, r=r[0], A=A, cost=cost, doubt=doubt)
+            if np.isfinite(fit.cost) and len(tried.which) < len(fit.coordinates):
+                broyden(A, fit, tried.values, tried.offsets, tried.r, tried.which)
+            A[:, :, tried.which] = tried.columns
+            doubt = self._doubt(self._data(fit, tried.r, tried.offsets))
+            fit = replace(fit, values=tried.values, offsets=tried.offsets, r=tried.r, A=A, cost=tried.cost, doubt=doubt)
             damping, reach = max(fit.damping / 5, 1e-7), np.minimum(2 * fit.reach, 1.0)
         else:
             # near a contact a start state's full step may be far too long, and no damping of the parameters shortens it
-            harmed = self._each(r[0], x) > self._each(fit.r, fit.offsets)
+            harmed = self._each(tried.r, tried.offsets) > self._each(fit.r, fit.offsets)
             damping, reach = fit.damping * 6, np.where(harmed, 0.25, 1.0) * fit.reach
         return replace(fit, damping=damping, reach=reach, history=(*fit.history, fit.cost))
 
@@ -233,7 +271,8 @@ class Fitter:
         precision, pull, low, high = fit.prior()
         S = S + np.diag(precision)
         p = solve(S + fit.damping * np.diag(_scale(fit, S)), g + pull, low, high)
-        by_starts = self._data(fit, fit.r, fit.offsets) - float(fit.weight @ q.c)
+        share = fit.reach * (2.0 - fit.reach)  # of what a whole step of the start states gains
+        by_starts = float(fit.weight @ (share * (self._each(fit.r, fit.offsets) - q.c)))
         promise = by_starts + float(2 * (g + pull) @ p - p @ S @ p)
         moved = fit.offsets + np.reshape(fit.reach, (-1, 1)) * starts.step(fit.A, p)
         return replace(fit, promise=promise), (fit.values + p, moved)
@@ -247,31 +286,6 @@ class Fitter:
         split = functools.partial(blocks, q, starts, fit.r, fit.A)
         return held_out(q, group, fit.weight, precision, pull, low, high, watched, split)
 
-    def innovations(self, fit: Fit, moves: Array, estimates: Array, plain: Array, at: Quadratic | None = None) -> Array:
-        """Held-out costs `[W]` with the uncertainty of the estimates that they were predicted with.
-
-        Conditions that alone tell a parameter count as they were predicted: without them nothing is known of it.
-
-        Args:
-            moves: `[G, k]`, to the estimates without a condition from where the costs `at` are those of.
-            estimates: `[G, k]`; plain: `[W]`, costs of the predictions themselves.
-            at: costs about points of the parameters; None: about the fit.
-        """
-        rest, tells = _rest(fit, self.spread, len(self.base))
-        q, costs, group = rest.q if at is None else at, plain.copy(), self.simulator.windows.group
-        for name, move, estimate in zip(np.unique(group), moves, estimates, strict=True):
-            own, point = group == name, estimate - move - fit.values
-            if not tells(own):
-                H = rest.curvature(own)[1]
-                costs[own] = predictive(q, own, fit.weight, move, H, rest.low - point, rest.high - point)
-        return costs
-
-    def told_alone(self, fit: Fit) -> list[bool]:
-        """Of each condition, whether it alone tells a parameter of an effect (a limit that is reached there only)."""
-        _, tells = _rest(fit, self.spread, len(self.base))
-        group = self.simulator.windows.group
-        return [tells(group == name) for name in np.unique(group)]
-
 
 def _scale(fit: Fit, S: Array) -> Array:
     """`[k]`, what a unit of damping adds to the curvatures: their own, and a share of the largest in units of ranges.
@@ -282,9 +296,3 @@ def _scale(fit: Fit, S: Array) -> Array:
     own = np.diag(S)
     width = np.array([c.high - c.low for c in fit.coordinates])
     return np.asarray(own + DAMPED * np.max(own * width**2, initial=0.0) / width**2)
-
-
-def _rest(fit: Fit, spread: Array, base: int) -> tuple[Rest, Callable[[NDArray[np.bool_]], bool]]:
-    """Fits without some windows, and whether some alone tell a parameter of an effect: one behind the first `base`."""
-    rest = Rest(fit.quadratic(spread)[0], fit.weight, *fit.prior())
-    return rest, rest.told_by(np.arange(base, len(fit.coordinates)))

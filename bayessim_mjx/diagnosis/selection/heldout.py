@@ -14,7 +14,7 @@ from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES as HELD_OUT
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
-from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.models import Model, told_alone
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import Gap
 
@@ -52,7 +52,7 @@ def refitted(fitter: Fitter, model: Model) -> Model:
     tells a parameter is held out in parts (`Fitter.scores`): its linear steps stay.
     """
     group, estimates = fitter.simulator.windows.group, model.estimates.copy()
-    alone = zip(np.unique(group), fitter.told_alone(model.fit), strict=True)
+    alone = zip(np.unique(group), told_alone(fitter, model.fit), strict=True)
     folds = {g: _Fold(fitter, model, group != name) for g, (name, told) in enumerate(alone) if not told}
     for _ in range(EFFORT.rounds):
         if not (running := [fold for fold in folds.values() if not fold.rests]):

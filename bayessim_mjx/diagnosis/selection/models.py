@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
+from bayessim_mjx.diagnosis.fitting.quadratic import Rest, predictive
 from bayessim_mjx.diagnosis.selection.numbers import PRIORS
 
 Array = NDArray[np.float64]
@@ -25,7 +26,7 @@ class Model:
     Attributes:
         effects: its candidates; fit: of its parameters.
         cost: `[W]`, held-out cost of each window (leave one operating condition out), starts re-estimated, with the
-            uncertainty of the parameters (`Fitter.innovations`); plain: without it.
+            uncertainty of the parameters (`_innovations`); plain: without it.
         estimates: `[G, k]`, parameters without each condition.
         samples: effective number of independent residuals.
     """
@@ -58,9 +59,39 @@ class Model:
 def scored(fitter: Fitter, fit: Fit, effects: Sequence[Candidate]) -> Model:
     """Return the held-out score of a fit."""
     plain, moves = fitter.scores(fit)
-    cost = fitter.innovations(fit, moves, fit.values + moves, plain)
+    cost = _innovations(fitter, fit, moves, plain)
     costs = np.maximum(cost, 1e-9), np.maximum(plain, 1e-9)
     return Model(tuple(effects), fit, *costs, fit.values + moves, effective_samples(fit, fitter))
+
+
+def _innovations(fitter: Fitter, fit: Fit, moves: Array, plain: Array) -> Array:
+    """Held-out costs `[W]` with the uncertainty of the estimates that they were predicted with.
+
+    Conditions that alone tell a parameter count as they were predicted: without them nothing is known of it.
+
+    Args:
+        moves: `[G, k]`, from the fit to the estimates without a condition; plain: `[W]`, costs of the predictions
+            themselves.
+    """
+    rest, costs, group = _rest(fitter, fit), plain.copy(), fitter.simulator.windows.group
+    for name, move, alone in zip(np.unique(group), moves, told_alone(fitter, fit), strict=True):
+        if not alone:
+            own = group == name
+            H = rest.curvature(own)[1]
+            costs[own] = predictive(rest.q, own, fit.weight, move, H, rest.low, rest.high)
+    return costs
+
+
+def told_alone(fitter: Fitter, fit: Fit) -> list[bool]:
+    """Of each condition, whether it alone tells a parameter of an effect (a limit that is reached there only)."""
+    tells = _rest(fitter, fit).told_by(np.arange(len(fitter.base), len(fit.coordinates)))
+    group = fitter.simulator.windows.group
+    return [tells(group == name) for name in np.unique(group)]
+
+
+def _rest(fitter: Fitter, fit: Fit) -> Rest:
+    """Fits without some of the windows."""
+    return Rest(fit.quadratic(fitter.spread)[0], fit.weight, *fit.prior())
 
 
 def effective_samples(fit: Fit, fitter: Fitter) -> float:

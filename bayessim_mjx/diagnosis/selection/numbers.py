@@ -80,10 +80,11 @@ class Effort:
     """How much is fitted and simulated; docs/decisions/numbers.md has the answers that more or less changes.
 
     Attributes:
-        sets: that a round fits around a set, with one, two and three effects more. As many as the first are brought to
-            convergence, as many as it has entries may widen their ranges, as many as in all are fitted in lockstep.
-        rounds: of whatever is repeated until it gains nothing, at most.
-        margin: nats below the leading set, within which a promised set is fitted.
+        sets: that a round fits around a set, with one, two and three effects more. Of as many as the first those within
+            `margin` are brought to convergence, as many as it has entries may widen their ranges, as many as in all are
+            fitted in lockstep.
+        rounds: of whatever is repeated until it gains nothing, at most; steps on some of the windows.
+        margin: nats below the leading set, within which a promised set is fitted, and a fit goes on.
         windows: that screening simulates. Half of them rank starts, where there are as many.
         steps: of a fit at most; it ends before where a step gains an irrelevant share of its cost (`Relevance.share`).
         close: times the best cost, up to which a fit on some windows goes on.

@@ -56,7 +56,6 @@ class SuccessiveHalving:
     def __init__(self, over: Callable[[], bool]) -> None:
         self.over = over
         self.pace: dict[int, float] = {}  # steps made -> cost of the best candidate, of all batches
-        self.least = np.inf  # cost of the best candidate in the end
 
     def among(self, starts: Sequence[int]) -> Callable[[int, Sequence[Fit], Sequence[int]], list[int]]:
         """Which fits of a batch go on, of candidates with so many starts each."""
@@ -68,8 +67,7 @@ class SuccessiveHalving:
             cost = np.array([fit.cost for fit in fits])
             best = np.array([float(np.min(cost[owner == i])) for i in range(len(starts))])
             self.pace[made] = min(self.pace.get(made, np.inf), float(best.min()))
-            behind = 1.0 + (EFFORT.close - 1.0) / EFFORT.close ** (made - 1)
-            limits = behind * np.minimum(best, EFFORT.close * self.pace[made])
+            limits = _behind(made) * np.minimum(best, EFFORT.close * self.pace[made])
             return [i for i in running if made < 1 or min(cost[i], _next(fits[i])) <= limits[owner[i]]]
 
         return going
@@ -80,13 +78,25 @@ class SuccessiveHalving:
             costs = [fit.history[min(made, len(fit.history) - 1)] for fit in fits if fit.history]
             self.pace[made] = min([self.pace.get(made, np.inf), *costs])
 
-    def finals(self, close: NDArray[np.bool_]) -> Callable[[int, Sequence[Fit], Sequence[int]], list[int]]:
-        """Which fits go on with all windows: each makes one step, so that it is ranked; only close ones make more."""
+    def finals(self) -> Callable[[int, Sequence[Fit], Sequence[int]], list[int]]:
+        """Which fits go on with all windows: each makes one step, so that it is ranked, then as starts of one model.
+
+        Fits that may come as close to the best as `Effort.margin` go on: the best of them decide the answer.
+        """
 
         def going(made: int, fits: Sequence[Fit], running: Sequence[int]) -> list[int]:
-            return [] if self.over() else [i for i in running if made < 1 or close[i]]
+            if self.over():
+                return []
+            self.pace[made] = best = min(self.pace.get(made, np.inf), *(fit.cost for fit in fits))
+            limit = best * _behind(made) + 2.0 * EFFORT.margin
+            return [i for i in running if made < 1 or min(fits[i].cost, _next(fits[i])) <= limit]
 
         return going
+
+
+def _behind(made: int) -> float:
+    """Return how many times the best cost a start may have after so many steps."""
+    return 1.0 + (EFFORT.close - 1.0) / EFFORT.close ** (made - 1)
 
 
 def _next(fit: Fit) -> float:
@@ -116,7 +126,7 @@ def fit_entries(
         parents: the fitted models that some entries extend. An entry that gains less on a subset of the windows than
             its prior odds cost (`log_prior`) becomes no model; `state.vain` holds it.
     """
-    halving = SuccessiveHalving(lambda: bool(part) and state.settings.budget.over(part))
+    halving, finals = (SuccessiveHalving(lambda: bool(part) and state.settings.budget.over(part)) for _ in range(2))
     total, done = sum(len(several) for several, _ in entries.values()), 0
     every = list(entries.items())
     leading = min((model.fit for model in parents.values()), key=lambda fit: fit.cost, default=state.base.fit)
@@ -127,7 +137,7 @@ def fit_entries(
             _left_out(state, [effects for _, (_, effects) in every[first:]], label)
             return
         done += sum(len(several) for several, _ in some.values())
-        _fit_batch(state, some, parents, own, halving, functools.partial(_say_left, say, label, done, total))
+        _fit_batch(state, some, parents, own, (halving, finals), functools.partial(_say_left, say, label, done, total))
         state.keep(state)
 
 
@@ -140,15 +150,16 @@ def _fit_batch(
     entries: Entries,
     parents: Parents,
     own: NDArray[np.int64] | None,
-    halving: SuccessiveHalving,
+    races: tuple[SuccessiveHalving, SuccessiveHalving],
     progress: Callable[[int], None],
 ) -> None:
     """All starts on a subset of the windows (None: on all); then the best start of each model on all windows."""
-    every = [several for several, _ in entries.values()]
+    every, (halving, finals) = [several for several, _ in entries.values()], races
     part = state.fitter if own is None else fitter_on(state.fitter, own)
     starts = [f if own is None else cut(f, own) for fs in every for f in fs]
-    rules = state.settings.iterations, state.fresh, RELEVANCE.share
-    fits = part.iterate(starts, *rules, progress, halving.among(list(map(len, every))))
+    rules, few = (state.fresh, RELEVANCE.share), min(state.settings.iterations, EFFORT.rounds)
+    steps = state.settings.iterations if own is None else few  # starts and models are ranked, and go on with all
+    fits = part.iterate(starts, steps, *rules, progress, halving.among(list(map(len, every))))
     halving.learn(fits)
     rest = iter(fits)
     pairs = (zip(itertools.islice(rest, len(fs)), fs, strict=True) for fs in every)
@@ -157,10 +168,9 @@ def _fit_batch(
     if own is not None:
         gaining = _gaining(state, part, own, best, parents)
         state.vain |= set(entries) - set(gaining)
-        halving.least = min(halving.least, *(fit.cost for fit in best.values()))
         again = [back(first[key][1], best[key], own) for key in gaining]
-        close = np.array([best[key].cost for key in gaining]) <= EFFORT.close * halving.least
-        found = state.fitter.iterate(again, *rules, None, halving.finals(close)) if again else []
+        found = state.fitter.iterate(again, state.settings.iterations, *rules, None, finals.finals()) if again else []
+        finals.learn(found)
         best = dict(zip(gaining, found, strict=True))
     for key, fit in best.items():
         state.models[key] = scored(state.fitter, fit, entries[key][1])

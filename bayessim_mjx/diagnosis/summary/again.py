@@ -18,7 +18,7 @@ from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.experiment.propose import SIZE
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting import windows
-from bayessim_mjx.diagnosis.fitting.discretisation import refined
+from bayessim_mjx.diagnosis.fitting.discretisation import FACTORS, refined
 from bayessim_mjx.diagnosis.fitting.robot import contacts
 from bayessim_mjx.diagnosis.fitting.simulator import FAR, Simulator, physics_of
 from bayessim_mjx.diagnosis.phrases import notes
@@ -32,8 +32,7 @@ Array = NDArray[np.float64]
 # Whole logs at most, each as long as an experiment (`SIZE.seconds`), and draws of the start, as many again of start and
 # parameters: seconds alone; a rule of thumb
 SEVERAL = 8
-# times as many steps as the fit took: a quarter of an error of first order is left, and extrapolated (Richardson 1911)
-FINER = 4
+FINER = FACTORS[-1]  # times as many steps as the fit took: the rest of the error, of first order, is extrapolated
 
 
 @dataclass(frozen=True, eq=False)

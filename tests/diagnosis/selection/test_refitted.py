@@ -9,7 +9,7 @@ import pytest
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.selection import heldout
-from bayessim_mjx.diagnosis.selection.models import scored
+from bayessim_mjx.diagnosis.selection.models import scored, told_alone
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 
 MOTION = np.sin(np.arange(8 * 20) * 0.7).reshape(8, 20)  # of eight windows
@@ -90,7 +90,7 @@ def test_on_rough_costs_estimates_differ_between_conditions_as_the_data_do():
 
 def test_a_condition_that_alone_tells_the_parameter_keeps_its_linear_steps():
     fitter, model = fitted(Bent((0.5, 0.5, 0.5, 0.8), felt=(1e-4, 1e-4, 1e-4, 1.0)))
-    assert fitter.told_alone(model.fit) == [False, False, False, True]
+    assert told_alone(fitter, model.fit) == [False, False, False, True]
     new = heldout.refitted(fitter, model)
     assert new.estimates[3] == model.estimates[3]
     assert new.estimates[:3, 0] == pytest.approx(model.fit.values[0], abs=0.01)
@@ -99,7 +99,7 @@ def test_a_condition_that_alone_tells_the_parameter_keeps_its_linear_steps():
 def test_what_the_other_conditions_hardly_tell_is_not_held_against_a_model():
     """Three quiet conditions tell the parameter to .16 and the fourth shows it: the model is right, and costs noise."""
     fitter, model = fitted(Bent((0.5, 0.5, 0.5, 0.5), felt=(0.03, 0.03, 0.03, 0.08), bend=0.0))
-    assert fitter.told_alone(model.fit) == [False] * 4
+    assert told_alone(fitter, model.fit) == [False] * 4
     last = GROUP == 3
     off = model.estimates[3, 0] - model.fit.values[0]
     assert model.plain[last].sum() > model.cost[last].sum()

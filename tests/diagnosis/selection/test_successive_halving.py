@@ -38,3 +38,14 @@ def test_fits_from_the_disk_set_the_same_pace_as_those_that_were_made():
     assert {at: read.pace[at] for at in range(1, 6)} == {at: made.pace[at] for at in range(1, 6)}
     made.learn([fit(*row) for row in rows])
     assert {at: made.pace[at] for at in read.pace} == pytest.approx(read.pace)
+
+
+def test_finalists_race_as_starts_of_one_model_but_those_that_may_still_be_the_answer_go_on():
+    finals = SuccessiveHalving(lambda: False).finals()
+    fits = [fit(9e5, 1000.0), fit(9e5, 1055.0), fit(9e5, 1065.0), fit(9e5, 3900.0)]
+    assert finals(0, fits, range(4)) == [0, 1, 2, 3]  # each makes one step
+    still = [fit(f.cost, f.cost) for f in fits]  # and gains no more
+    assert finals(1, still, range(4)) == [0, 1, 2, 3]  # 4 times the best
+    assert finals(3, still, range(4)) == [0, 1, 2]  # 1 + 3 / 16
+    assert finals(9, still, range(4)) == [0, 1]  # 30 nats are twice that in a cost
+    assert SuccessiveHalving(lambda: True).finals()(1, fits, [0]) == []
