@@ -204,13 +204,15 @@ def _checked(args: argparse.Namespace) -> int:
 
 
 def _shown(args: argparse.Namespace) -> int:
-    """Write the page of the logs; exit code 0."""
+    """Write the page of the logs; exit code 0. A package that is missing is named before the logs are read."""
     for flag, path in (("--out", args.out), ("--mcap", args.mcap)):
         if path:
             cli.writable(Path(path).parent, flag)
     from bayessim_mjx.logs import mcap_file, views
     from bayessim_mjx.report import log_page
 
+    if args.mcap:
+        mcap_file.writer()
     shown = views.view(Path(args.path), _model(args), args.map)
     for what in shown.overview.missing:
         print(f"missing: {what}")
