@@ -26,8 +26,8 @@ FORMATS = {
 def _parser() -> cli.PlainParser:
     text = "Check logs, or convert recordings to a folder of CSV files and a map of their columns (docs/logs.md)."
     prog = cli.prog_of("logs")
-    parser = cli.PlainParser("logs", description=text, usage="%(prog)s FORMAT PATH [PATH ...] [options]")
-    formats = parser.add_subparsers(dest="format", metavar="FORMAT", required=True, prog=prog)
+    parser = cli.PlainParser("logs", description=text, usage="%(prog)s COMMAND PATH [PATH ...] [options]")
+    formats = parser.add_subparsers(dest="format", metavar="COMMAND", required=True, prog=prog)
     of = {name: formats.add_parser(name, help=what, description=f"Convert {what}.") for name, what in FORMATS.items()}
     for name, each in of.items():
         each.usage = f"{each.prog} PATH [PATH ...] --out DIR [options]"

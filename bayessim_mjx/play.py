@@ -42,7 +42,7 @@ def _parser() -> cli.Parser:
     tests.add_argument("--num_envs", metavar="N", type=cli.whole(0, COUNT), dest="worlds", help="same as --episodes")
     tests.add_argument("--physics", choices=KINDS, help="evaluate on this kind of physics only (default: all)")
     text = "play the policy of the task that comes with the package (docs/pretrained.md)"
-    parser.group("training").add_argument("--use_pretrained_checkpoint", action="store_true", help=text)
+    parser.group("policy").add_argument("--use_pretrained_checkpoint", action="store_true", help=text)
     text = "write the policy as an ONNX file and stop (default: in exported/ of the run)"
     files.add_argument("--export", metavar="FILE", nargs="?", const="", help=text)
     text = "write a folder for a model hub: ONNX file, settings, and a card with the returns"
