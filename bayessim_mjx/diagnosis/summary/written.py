@@ -11,10 +11,11 @@ import mujoco
 from bayessim_mjx import urdf
 from bayessim_mjx.diagnosis.correction import Found, correction
 from bayessim_mjx.diagnosis.fitting.simulable import one_line
+from bayessim_mjx.diagnosis.phrases.advice import MODEL
 from bayessim_mjx.effects.support import native, storage
 from bayessim_mjx.parameters import ParameterSpace
 
-MODEL, URDF = "model_with_effects.xml", "model_with_effects.urdf"
+URDF = "model_with_effects.urdf"
 # what a URDF has elements for: effects, and attributes of recalibrated parameters
 IN_URDF = ("coulomb_friction", "viscous_friction", "payload", "inertial_parameters")
 CALIBRATED_IN_URDF = ("damping", "friction", "mass", "inertia", "com_x", "com_y", "com_z")
