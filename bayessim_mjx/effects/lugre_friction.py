@@ -83,7 +83,7 @@ class LugreFriction(Effect):
         return resist(at, memory, step, steady, level + excess, bend, self.ratio)
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
-        """Its level alone, as frictionloss."""
+        """Write its level alone, as frictionloss."""
         lose(spec, values)
         return Part("presliding and the excess at low speed, which MuJoCo's joints do not have; use effects.yaml")
 
