@@ -112,7 +112,11 @@ class Report:
         if not self.widths:
             return _covered("HPD coverage", self.coverage)
         pit = np.asarray(self.ranks.parameters, np.float64)
-        own = {i: _shares(2 * np.abs(pit[:, i] - 0.5)) for i in self.widths[:MOST]}
+        n, away = self.pairs, 2 * np.abs(pit - 0.5)
+        own = {
+            i: {a: (float(np.mean(away[:, i] <= a)), float(np.sqrt(a * (1 - a) / n))) for a in LEVELS}
+            for i in self.widths[:MOST]
+        }
         return "; ".join(_covered(f"intervals of {self.names[i]}", shares) for i, shares in own.items())
 
     def to_dict(self) -> dict[str, Any]:
@@ -149,7 +153,7 @@ def judge(found: Ranks, space: Any) -> Report:
     """Make the report on given ranks."""
     n, names = len(found.level), tuple(space.names)
     pit = np.asarray(found.parameters, np.float64)
-    coverage = _shares(found.level)
+    coverage = {a: (float(np.mean(found.level <= a)), float(np.sqrt(a * (1 - a) / n))) for a in LEVELS}
     p = {name: uniform_p(pit[:, i]) for i, name in enumerate(names)}
     p |= {"HPD level": uniform_p(np.asarray(found.level)), "TARP": uniform_p(np.asarray(found.tarp))}
     # sd of U is 1/sqrt(12), that of (U - 1/2)^2 is 1/sqrt(180)
@@ -161,11 +165,6 @@ def judge(found: Ranks, space: Any) -> Report:
     contraction = 1 - found.variance.mean(0) / np.var(np.asarray(prior), axis=0)
     gain = float(found.gain.mean())
     return Report(names, verdict, words, coverage, p, bias, spread, gain, contraction, found, widths=widths)
-
-
-def _shares(levels: np.ndarray) -> dict[float, tuple[float, float]]:
-    """{nominal level: (share of truths inside, standard error)}."""
-    return {a: (float(np.mean(levels <= a)), float(np.sqrt(a * (1 - a) / len(levels)))) for a in LEVELS}
 
 
 def _covered(what: str, shares: dict[float, tuple[float, float]]) -> str:
