@@ -26,8 +26,8 @@ FORMATS = {
 def _parser() -> cli.PlainParser:
     text = "Check logs, or convert recordings to a folder of CSV files and a map of their columns (docs/logs.md)."
     prog = cli.prog_of("logs")
-    parser = cli.PlainParser("logs", description=text, usage="%(prog)s FORMAT PATH [PATH ...] [options]")
-    formats = parser.add_subparsers(dest="format", metavar="FORMAT", required=True, prog=prog)
+    parser = cli.PlainParser("logs", description=text, usage="%(prog)s COMMAND PATH [PATH ...] [options]")
+    formats = parser.add_subparsers(dest="format", metavar="COMMAND", required=True, prog=prog)
     of = {name: formats.add_parser(name, help=what, description=f"Convert {what}.") for name, what in FORMATS.items()}
     for name, each in of.items():
         each.usage = f"{each.prog} PATH [PATH ...] --out DIR [options]"
@@ -204,13 +204,15 @@ def _checked(args: argparse.Namespace) -> int:
 
 
 def _shown(args: argparse.Namespace) -> int:
-    """Write the page of the logs; exit code 0."""
+    """Write the page of the logs; exit code 0. A package that is missing is named before the logs are read."""
     for flag, path in (("--out", args.out), ("--mcap", args.mcap)):
         if path:
             cli.writable(Path(path).parent, flag)
     from bayessim_mjx.logs import mcap_file, views
     from bayessim_mjx.report import log_page
 
+    if args.mcap:
+        mcap_file.writer()
     shown = views.view(Path(args.path), _model(args), args.map)
     for what in shown.overview.missing:
         print(f"missing: {what}")

@@ -17,9 +17,10 @@ from bayessim_mjx.config import Config, freeze, replace
 from bayessim_mjx.config.settings import COUNT
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.quantities import compact, estimate
+from bayessim_mjx.quantities import compact, estimate, fixed, power
 
 DESCRIPTION = "Evaluate, film or export a saved policy."
+HEADER = ["physics", "return", "median", "lowest", "highest", "episode length"]
 KINDS = {
     "nominal": "nominal physics",
     "prior": "physics drawn from the prior",
@@ -42,7 +43,7 @@ def _parser() -> cli.Parser:
     tests.add_argument("--num_envs", metavar="N", type=cli.whole(0, COUNT), dest="worlds", help="same as --episodes")
     tests.add_argument("--physics", choices=KINDS, help="evaluate on this kind of physics only (default: all)")
     text = "play the policy of the task that comes with the package (docs/pretrained.md)"
-    parser.group("training").add_argument("--use_pretrained_checkpoint", action="store_true", help=text)
+    parser.group("policy").add_argument("--use_pretrained_checkpoint", action="store_true", help=text)
     text = "write the policy as an ONNX file and stop (default: in exported/ of the run)"
     files.add_argument("--export", metavar="FILE", nargs="?", const="", help=text)
     text = "write a folder for a model hub: ONNX file, settings, and a card with the returns"
@@ -182,6 +183,22 @@ def _acted_in(config: Config, run: Any) -> Any:
     return cli.privileged(replace(config, ppo={"teacher": None}), registry.make(config.task, config=config), run)[0]
 
 
+def returns_table(rows: Sequence[tuple[str, Any, Any]]) -> list[list[str]]:
+    """Table of (physics, returns, lengths of episodes): returns to one digit, so that they can be compared.
+
+    The median stands beside the mean: a few bad episodes pull the mean, and its sd passes the best return.
+    """
+    import numpy as np
+
+    every = np.abs(np.concatenate([np.ravel(r) for _, r, _ in rows]))
+    places = max(0, 3 - power(float(every[np.isfinite(every)].max(initial=0.0))))  # four digits of the largest
+
+    def cells(r: Any) -> list[str]:
+        return [fixed(float(x), places) for x in (np.median(r), r.min(), r.max())]
+
+    return [[name, estimate(r.mean(), r.std()), *cells(r), compact(length.mean())] for name, r, length in rows]
+
+
 def _policy(args: argparse.Namespace, config: Config, path: Path, env: Any) -> Any:
     """Load the policy of the checkpoint, or that which comes with the package."""
     if not args.use_pretrained_checkpoint:
@@ -224,14 +241,16 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     chosen, rows = {name: kinds[name]() for name in kinds if args.physics in (None, name)}, []
     returns = {}
     for name, thetas in chosen.items():
+        console.say(f"evaluating on {KINDS[name]} ...")
         result = rl.evaluate(plain if name == "nominal" else env, policy, branch(key, 1), thetas)
         r, length = result["return"], result["length"]
         returns[name] = r
-        rows.append([name, estimate(r.mean(), r.std()), *map(compact, (r.min(), r.max(), length.mean()))])
-    console.grid(["physics", "return", "lowest", "highest", "episode length"], rows)
+        rows.append((name, r, length))
+    console.grid(HEADER, returns_table(rows))
     if args.hub:
         console.say(_hub(args, env, policy, config, run, returns))
     if config.monitor.video:
+        console.say("filming an episode ...")
         name = next(n for n in ("real", "posterior", "prior", "nominal") if n in chosen)
         folder = (run.path if run is not None else path.parent) / "videos" / "play"
         shown = plain if name == "nominal" else env

@@ -16,7 +16,7 @@ WIDTH = 120  # characters of a line where no terminal says it
 def _parser() -> cli.PlainParser:
     prog = cli.prog_of("policy")
     parser = cli.PlainParser("policy", description=DESCRIPTION, usage="%(prog)s check FILE --logs DIR [options]")
-    parts = parser.add_subparsers(dest="part", metavar="check", required=True, prog=prog)
+    parts = parser.add_subparsers(dest="part", metavar="COMMAND", required=True, prog=prog)
     text = "order, signs, frames, scales, offsets, rates and delays of a deployed policy"
     check = parts.add_parser("check", help=text, description=f"Compare {text} with its file.")
     check.usage = f"{prog} check FILE --logs DIR [options]"

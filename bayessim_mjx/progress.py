@@ -57,11 +57,15 @@ class Lines:
     def __init__(self, file: TextIO, now: Callable[[], float] = time.monotonic):
         self.file, self.now, self.began = file, now, now()
         self.stage, self.since, self.first, self.reported = "", self.began, 0, 0.0
+        self.done, self.at = 0, self.began  # the last count, and when it was reached
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
         now = self.now()
         if stage != self.stage:
             self.stage, self.since, self.first, self.reported = stage, now, done, -EVERY
+            self.done, self.at = done, now
+        if done != self.done:
+            self.done, self.at = done, now
         if now - self.reported >= EVERY:
             self.reported = now
             counted = f": {done} of {total}{self._left(now, done, total)}" if total > 1 else ""
@@ -71,11 +75,12 @@ class Lines:
         print(text, file=self.file, flush=True)
 
     def _left(self, now: float, done: int, total: int) -> str:
-        """Time to go in this stage, from what was done in it."""
+        """Time to go in this stage at the pace of its last count; nothing where that time is over."""
         made = done - self.first
-        return (
-            f", about {duration((now - self.since) / made * (total - done))} left" if made > 0 and done < total else ""
-        )
+        if made <= 0 or done >= total:
+            return ""
+        left = (self.at - self.since) / made * (total - done) - (now - self.at)
+        return f", about {duration(left)} left" if left > 0 else ""
 
 
 class Bars:

@@ -23,4 +23,16 @@ assert "bayessim_mjx" in readme and not relative, f"PyPI cannot follow {relative
 from bayessim_mjx.rl import pretrained  # noqa: E402
 
 assert [pretrained.pretrained(name) for name in pretrained.names()], "the wheel lacks the policies"
+
+import os  # noqa: E402
+import tempfile  # noqa: E402
+
+import numpy as np  # noqa: E402
+
+from bayessim_mjx import programs  # noqa: E402
+
+with tempfile.TemporaryDirectory() as cache:  # a diagnosis keeps its programs, so what writes them has to be there
+    os.environ["BAYESSIM_MJX_CACHE"] = cache
+    programs.Kept(lambda x: 2 * x, "a product")(np.ones(3, np.float32))
+    assert list(pathlib.Path(cache, programs.FOLDER).iterdir()), "no program was kept"
 print("wheel: only bayessim_mjx is installed, tasks inside it")

@@ -203,6 +203,15 @@ def test_sentences_of_the_console_are_those_of_the_package():
     assert len(long) > 20 and [part for part in long if part not in spoken()] == []
 
 
+def test_the_first_look_of_the_docs_is_that_of_the_package():
+    """The lines before any simulation are copied from a run: their words are still those of the package."""
+    page = (ROOT / "docs/diagnosis.md").read_text()
+    block = page.partition("Before any simulation (")[2].partition("```")[0]
+    parts = re.split(r"command -> motion: |elbow|Coulomb friction|level|\n|\d[\d.]*", block)
+    long = [text for part in parts if len(text := part.strip(" %;\n+-")) > 10]
+    assert len(long) > 4 and [text for text in long if text not in spoken()] == []
+
+
 def test_a_film_of_every_task_says_what_it_shows():
     films, page = ROOT / "docs" / "pictures" / "tasks", (ROOT / "docs" / "tasks.md").read_text()
     shown = json.loads((films / "films.json").read_text())

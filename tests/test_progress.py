@@ -61,13 +61,32 @@ def test_lines_have_counts_and_the_time_to_go():
     say("known parameters", 0, 1)
     say("pairs", 0, 21)  # at 2 s
     say("pairs", 6, 21)  # 9 s later: not yet
-    say("pairs", 6, 21)  # 13 s after it began: 15 more take 32 s
+    say("pairs", 6, 21)  # 4 s after that: 15 more take 22 s from then on
     say("pairs", 9, 21)
     say("rivals", 0, 3)
     lines = file.getvalue().splitlines()
     assert lines == [
         "   1.0 s  known parameters",
         "   2.0 s  pairs: 0 of 21",
-        "  15.0 s  pairs: 6 of 21, about 32 s left",
+        "  15.0 s  pairs: 6 of 21, about 18 s left",
         "  17.0 s  rivals: 0 of 3",
     ]
+
+
+def test_the_time_to_go_runs_down_while_a_part_lasts_and_is_not_made_up_where_it_is_over():
+    clock, file = iter([0.0, 0.0, 20.0, 30.0, 41.0, 60.0]), io.StringIO()
+    say = Lines(file, lambda: next(clock))
+    say("polishing", 0, 3)
+    for done in (1, 1, 1, 2):
+        say("polishing", done, 3)
+    assert [line.strip() for line in file.getvalue().splitlines()[1:]] == [
+        "20.0 s  polishing: 1 of 3, about 40 s left",
+        "30.0 s  polishing: 1 of 3, about 30 s left",
+        "41.0 s  polishing: 1 of 3, about 19 s left",
+        "60.0 s  polishing: 2 of 3, about 30 s left",
+    ]
+    clock, file = iter([0.0, 0.0, 6.0, 20.0]), io.StringIO()
+    say = Lines(file, lambda: next(clock))
+    for done in (0, 1, 1):
+        say("polishing", done, 2)
+    assert file.getvalue().splitlines()[-1].endswith("polishing: 1 of 2")

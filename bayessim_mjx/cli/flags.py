@@ -38,7 +38,8 @@ FLAGS: dict[str, tuple[str, Any, str]] = {
     "--cache_dir": ("cache_dir", str, "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"),
 }
 TASK, TRAINING, OUTPUT, COMPUTING = "task and settings", "training", "output", "computing"
-ORDER = (TASK, "diagnosis", "real system", "physics", TRAINING, "evaluation", OUTPUT, COMPUTING)  # of headings
+PLAYED = "policy"  # heading of the checkpoint in `play`
+ORDER = (TASK, "diagnosis", "real system", "physics", PLAYED, TRAINING, "evaluation", OUTPUT, COMPUTING)  # of headings
 HEADINGS = {
     TASK: ("--num_envs", "--episode_length", "--seed"),
     TRAINING: ("--max_iterations",),
@@ -126,7 +127,7 @@ class Parser(PlainParser):
 
     def _start(self, resume: bool) -> None:
         """Add the flags that say which policy or run a command begins with."""
-        group = self.group(TRAINING)
+        group = self.group(PLAYED if self.command == "play" else TRAINING)
         text = SAID.get((self.command, "--checkpoint"), "policy to start from")
         group.add_argument("--checkpoint", metavar="PATH|latest|best", help=text)
         group.add_argument("--use_last_checkpoint", action="store_true", help="same as --checkpoint latest")

@@ -9,10 +9,12 @@ from typing import Any, NoReturn
 from bayessim_mjx import trust
 from bayessim_mjx.cli import commands
 from bayessim_mjx.cli.commands import SCRIPT
-from bayessim_mjx.errors import UserError, nearest
+from bayessim_mjx.errors import UserError, nearest, unknown
 from bayessim_mjx.outside_tasks import is_file
 
 GENERAL = "options"  # argparse's own heading of --help
+# argparse's words for a value that is none of the choices; its quotes differ between versions of Python
+CHOICE = re.compile(r"(?P<what>.+): invalid choice: '(?P<given>.*)' \(choose from (?P<allowed>.*)\)")
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
@@ -122,7 +124,11 @@ class PlainParser(argparse.ArgumentParser):
         return UserError(f"{error} ({self.prog} --help lists all)")
 
     def error(self, message: str) -> NoReturn:
-        raise self.refusal(UserError(message.removeprefix("argument ")))
+        text = message.removeprefix("argument ")
+        if choice := CHOICE.fullmatch(text):
+            names = [name.strip(" '") for name in choice["allowed"].split(",")]
+            raise self.refusal(unknown(choice["what"], choice["given"], names))
+        raise self.refusal(UserError(text))
 
 
 class Version(argparse.Action):

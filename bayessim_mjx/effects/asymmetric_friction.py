@@ -5,13 +5,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 
-from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.friction import resist
+from bayessim_mjx.effects.effect import Effect, Part, Quantity
+from bayessim_mjx.effects.support.friction import add, lose, native, resist
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
 if TYPE_CHECKING:
     import mujoco
+
+
+NUMBERS = ("level", "viscous")  # of each direction
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,4 +42,9 @@ class AsymmetricFriction(Effect):
         return memory, resist(at, step, level=values[:, :2], damping=values[:, 2:])
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
-        return "MuJoCo's joint friction and damping are the same in both directions; use effects.yaml"
+        """Write the mean of both directions, as frictionloss and damping."""
+        mean = {w: {n: (own[f"{n}_forward"] + own[f"{n}_backward"]) / 2 for n in NUMBERS} for w, own in values.items()}
+        lose(spec, mean)
+        for joint, own in native(spec, mean):
+            add(joint, "damping", own["viscous"])
+        return Part("its dependence on the direction, which MuJoCo's joints do not have; use effects.yaml")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.friction import add, dry, native
+from bayessim_mjx.effects.support.friction import dry, lose
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
@@ -42,9 +42,6 @@ class CoulombFriction(Effect):
         return memory, dry(at, step, at.values(theta)[:, 0])
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
-        """Native: frictionloss, as stiff as MuJoCo allows (two timesteps): it slips least while it should stick."""
-        for joint, own in native(spec, values):
-            if own["level"]:
-                add(joint, "frictionloss", own["level"])
-                joint.solref_friction = [2.0 * spec.option.timestep, 1.0]
+        """Native: frictionloss."""
+        lose(spec, values)
         return None

@@ -222,9 +222,13 @@ class Effect(abc.ABC):
         """Write the effect into `spec` where MuJoCo can express it natively; `values[place][quantity]`.
 
         Returns:
-            None where written, else why not (one sentence for people).
+            None where written, else why not (one sentence for people); a `Part` where a part of it is written.
         """
         return "MuJoCo has no such element"
+
+
+class Part(str):
+    """What of an effect `Effect.edit` could not write, where it wrote the rest."""
 
 
 def overrides(effect: Effect, hook: str) -> bool:

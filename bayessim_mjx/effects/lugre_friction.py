@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.effect import Effect, Part, Quantity
+from bayessim_mjx.effects.support.friction import lose
 from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
@@ -82,7 +83,9 @@ class LugreFriction(Effect):
         return resist(at, memory, step, steady, level + excess, bend, self.ratio)
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
-        return "MuJoCo's joints have no friction with presliding; use effects.yaml"
+        """Write its level alone, as frictionloss."""
+        lose(spec, values)
+        return Part("presliding and the excess at low speed, which MuJoCo's joints do not have; use effects.yaml")
 
 
 def start(at: Site) -> dict[str, jax.Array]:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.friction import dry
+from bayessim_mjx.effects.effect import Effect, Part, Quantity
+from bayessim_mjx.effects.support.friction import dry, lose
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
@@ -56,4 +56,8 @@ class StribeckFriction(Effect):
         return memory, dry(at, step, level + excess * share)
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
-        return "MuJoCo's joint friction does not depend on the speed; use effects.yaml"
+        """Its level alone, as frictionloss."""
+        lose(spec, values)
+        return Part(
+            "its excess at low speed, as MuJoCo's joint friction does not depend on the speed; use effects.yaml"
+        )

@@ -23,10 +23,11 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.numbers import ALPHA, DRAWS, FEW
 from bayessim_mjx.inference.temperature import LEVELS, TEMPERATURES, temperature, widened
 from bayessim_mjx.keys import branch
-from bayessim_mjx.quantities import percent, percent_estimate
+from bayessim_mjx.quantities import MOST, listed, percent, percent_estimate
 
 FEWEST = round(1 / (1 - LEVELS[-1]))  # pairs that a verdict needs: one of them lies outside the largest region
 CALIBRATED, OVER, UNDER, BIASED, ODD = "calibrated", "over-confident", "under-confident", "biased", "miscalibrated"
+HOW = ("narrow", "wide")  # widths of an over-confident and an under-confident posterior
 
 
 class Ranks(NamedTuple):
@@ -96,16 +97,27 @@ class Report:
     ranks: Ranks
     temperature: float | None = None  # factor on the standard deviations that was applied
     before: str | None = None  # the verdict without it
+    widths: tuple[int, ...] = ()  # parameters on whose widths alone an over- or under-confident verdict rests
     predictive: float | None = None  # p-value of the posterior predictive check
 
     @property
     def pairs(self) -> int:
         return len(self.ranks.level)
 
-    def table(self) -> str:
-        """Coverage in words: `50 %: 49 ± 2 %, 80 %: ...`."""
-        rows = [f"{percent(a)}: {percent_estimate(c, s, 1)}" for a, (c, s) in self.coverage.items()]
-        return ", ".join(rows)
+    def evidence(self) -> str:
+        """Return the coverage that the verdict rests on: `HPD coverage 50 %: 49 ± 2 %, 80 %: ...`.
+
+        The regions of all parameters may hold enough where one parameter's intervals do not: then these.
+        """
+        if not self.widths:
+            return _covered("HPD coverage", self.coverage)
+        pit = np.asarray(self.ranks.parameters, np.float64)
+        n, away = self.pairs, 2 * np.abs(pit - 0.5)
+        own = {
+            i: {a: (float(np.mean(away[:, i] <= a)), float(np.sqrt(a * (1 - a) / n))) for a in LEVELS}
+            for i in self.widths[:MOST]
+        }
+        return "; ".join(_covered(f"intervals of {self.names[i]}", shares) for i, shares in own.items())
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
@@ -148,33 +160,46 @@ def judge(found: Ranks, space: Any) -> Report:
     bias = (pit.mean(0) - 0.5) * np.sqrt(12 * n)
     spread = (np.mean((pit - 0.5) ** 2, axis=0) - 1 / 12) * np.sqrt(180 * n)
     level = (found.level.astype(np.float64).mean() - 0.5) * np.sqrt(12 * n)
-    verdict, words = _verdict(names, bias, spread, float(level), p)
+    verdict, words, widths = _verdict(names, bias, spread, float(level), p)
     prior = jax.vmap(space.from_unit)(jnp.asarray(box.lattice(1024, len(space))))
     contraction = 1 - found.variance.mean(0) / np.var(np.asarray(prior), axis=0)
     gain = float(found.gain.mean())
-    return Report(names, verdict, words, coverage, p, bias, spread, gain, contraction, found)
+    return Report(names, verdict, words, coverage, p, bias, spread, gain, contraction, found, widths=widths)
+
+
+def _covered(what: str, shares: dict[float, tuple[float, float]]) -> str:
+    rows = [f"{percent(a)}: {percent_estimate(c, s, 1)}" for a, (c, s) in shares.items()]
+    return f"{what} {', '.join(rows)}"
 
 
 def _verdict(
     names: Sequence[str], bias: np.ndarray, spread: np.ndarray, level: float, p: dict[str, float]
-) -> tuple[str, str]:
-    """(verdict, sentence): each of four families of tests has a quarter of ALPHA, shared by its members."""
+) -> tuple[str, str, tuple[int, ...]]:
+    """(verdict, sentence, parameters on whose widths alone it rests).
+
+    Each of four families of tests has a quarter of ALPHA, shared by its members.
+    """
     limit = ALPHA / 4
     biased = [i for i in range(len(names)) if _two_sided(bias[i]) < limit / len(names)]
     odd_width = [i for i in range(len(names)) if _two_sided(spread[i]) < limit / len(names)]
     joint = _two_sided(level) < limit
     if biased:
         sides = [f"{names[i]} (the truth is {'above' if bias[i] > 0 else 'below'})" for i in biased]
-        return BIASED, f"biased in {', '.join(sides)}"
-    if joint or odd_width:
-        total = level if joint else float(spread[odd_width].sum())
-        where = f", most in {names[int(np.argmax(np.abs(spread)))]}" if odd_width and len(names) > 1 else ""
-        kind, how = (OVER, "narrow") if total > 0 else (UNDER, "wide")
-        return kind, f"{kind}: too {how}{where}"
+        return BIASED, f"biased in {', '.join(sides)}", ()
+    if joint:
+        kind, how = (OVER, HOW[0]) if level > 0 else (UNDER, HOW[1])
+        most = int(np.argmax(np.sign(level) * spread))
+        where = f", most in {names[most]}" if most in odd_width and len(names) > 1 else ""
+        return kind, f"{kind}: too {how}{where}", ()
+    if odd_width:
+        kind, order = (OVER, HOW) if spread[odd_width].sum() > 0 else (UNDER, HOW[::-1])
+        sides = {how: [names[i] for i in odd_width if (spread[i] > 0) == (how == "narrow")] for how in order}
+        texts = [f"too {how} in {listed(own, most=MOST)}" for how, own in sides.items() if own]
+        return kind, f"{kind}: {', '.join(texts)}", tuple(odd_width)
     worst = min(p, key=lambda name: p[name])
     if p[worst] < limit / len(p):
-        return ODD, f"{ODD}: the ranks of {worst} are not uniform (p = {p[worst]:.1g}), the shape is wrong"
-    return CALIBRATED, CALIBRATED
+        return ODD, f"{ODD}: the ranks of {worst} are not uniform (p = {p[worst]:.1g}), the shape is wrong", ()
+    return CALIBRATED, CALIBRATED, ()
 
 
 def _two_sided(z: float) -> float:

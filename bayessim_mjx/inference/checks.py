@@ -55,7 +55,7 @@ class Checks:
         report = self.calibration
         reality = "unlike simulated ones" if self.misfit.flagged else "like simulated ones"
         return (
-            f"network's posterior {report.words} (HPD coverage {report.table()}); "
+            f"network's posterior {report.words} ({report.evidence()}); "
             f"real trajectories {reality}, p = {self.misfit.joint:.2g}"
         )
 

@@ -131,8 +131,8 @@ class Sets:
         """A sentence on the number of trajectories that sharpen the posterior."""
         last = self.counts[-1].trajectories
         if self.saturates_at == last:
-            return f"the network carries all {last} trajectories: each more sharpened the posterior"
-        return f"the network carries {self.saturates_at} of {last} trajectories: more do not sharpen the posterior"
+            return f"each of the {last} trajectories sharpened the posterior"
+        return f"only {self.saturates_at} of {last} trajectories sharpen the posterior"
 
     def sentence(self) -> str:
         """One line for a person."""
@@ -142,16 +142,16 @@ class Sets:
         if many > last.trajectories:
             judged = self.widening(last.trajectories)
             text += (
-                f" (sets of {last.trajectories} were simulated, which ask for {judged:.2f}: an error that all share)"
+                f" ({judged:.2f} for simulated sets of {last.trajectories}: their error is shared by all trajectories)"
             )
         elif widening > last.widening:
             text += f" ({last.widening:.2f} on average over the prior, more where the posterior lies)"
         if self.move is not None:
-            text += "; where the posterior lies the network leans to one side, by which it is moved back"
+            text += "; near the posterior the network is biased; each factor is moved by that bias"
         if not self.settled:
-            text += "; the last sets still asked for more: take it for too narrow"
+            text += "; the last simulated sets needed more: the product is too narrow"
         if self.saturates_at < last.trajectories:
-            text += f"; the network carries {self.saturates_at}, more do not sharpen the posterior"
+            text += f"; {self.saturation}"
         return text
 
 

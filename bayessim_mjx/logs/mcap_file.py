@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,22 +16,31 @@ TOPICS = {"ctrl": "commands", "qpos": "positions", "qvel": "velocities", "effort
 MOST = 2_000_000  # messages of a file: of longer logs every n-th row is written; a rule of thumb
 
 
+def writer() -> Any:
+    """Return the class that writes.
+
+    Raises:
+        UserError: the package mcap is not installed.
+    """
+    return needs("mcap.writer", "--mcap", "mcap").Writer
+
+
 def write(path: Path, sheets: Sequence[Sheet]) -> int:
     """Write one topic for each log and stream, such as `/run1/positions`; returns the number of messages.
 
     Raises:
         UserError: the package mcap is not installed.
     """
-    writer_of = needs("mcap.writer", "--mcap", "mcap").Writer
+    of = writer()
     every = max(1, -(-sum(len(s.time) for s in sheets) * len(STREAMS) // MOST))
     path.parent.mkdir(parents=True, exist_ok=True)
     written = 0
     with path.open("wb") as file:
-        writer = writer_of(file)
-        writer.start(library="bayessim_mjx")
+        out = of(file)
+        out.start(library="bayessim_mjx")
         for sheet in sheets:
-            written += _one(writer, sheet, every)
-        writer.finish()
+            written += _one(out, sheet, every)
+        out.finish()
     return written
 
 

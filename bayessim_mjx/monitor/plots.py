@@ -220,10 +220,8 @@ def _sets(axes: Any, sets: Any) -> None:
     axes.set_xscale("log", base=2)
     axes.set_xticks(counts, [str(n) for n in counts])
     axes.minorticks_off()
-    axes.set(
-        ylim=(0, 1.1), xlabel="trajectories", ylabel="share of true parameters inside (bands: ± 2 standard errors)"
-    )
-    title = "as used, on simulated sets; above: gain in nats"
+    axes.set(ylim=(0, 1.1), xlabel="trajectories", ylabel="share of true parameters inside")
+    title = "posteriors of several trajectories, on simulated sets\nbands: ± 2 standard errors; on top: gain in nats"
     axes.set_title("\n".join([title, *textwrap.wrap(sets.saturation, 56)]), fontsize=9, loc="left")
     axes.legend(loc="lower left", frameon=False, fontsize=8)
 

@@ -7,7 +7,9 @@ import numpy as np
 
 from bayessim_mjx.monitor.style import BLUE, GREEN, handles, heading, new_figure
 from bayessim_mjx.monitor.tables import shorten
-from bayessim_mjx.quantities import percent
+from bayessim_mjx.quantities import compact, percent
+
+THIN = 0.04  # of a panel's height: twice the width of the line of the real motion; no source: a matter of style
 
 
 def predictive(
@@ -23,6 +25,8 @@ def predictive(
     lines: int = 4,
 ) -> Any:
     """Real motion against the 50 and 90 % bands of simulated motion and a few single simulations.
+
+    Where the bands would hide under the line, the median simulation is subtracted from all.
 
     Args:
         time: [T] seconds. real: {channel: [T] or [m, T]}. simulated: {channel: [n, T]}; NaN where an episode was over.
@@ -46,10 +50,11 @@ def predictive(
         axes.remove()
     for k, (axes, name) in enumerate(zip(grid, shown, strict=False)):
         pale = None if before is None or name not in before else _rows(before[name], time, name)
-        _channel(axes, time, *data[name], pale, lines)
-        unit = (units or {}).get(name, "")
-        axes.set_title(_title(name, unit, *data[name]), fontsize=9, loc="left")
-        axes.set_ylabel(_axis(name, unit), fontsize=8)
+        unit, (own, others), thin = (units or {}).get(name, ""), data[name], _thin(*data[name])
+        zero = _percentiles(others, [50])[0] if thin else 0.0
+        _channel(axes, time, own - zero, others - zero, None if pale is None else pale - zero, lines)
+        axes.set_title(_title(name, unit, own, others, thin), fontsize=9, loc="left")
+        axes.set_ylabel(_axis(name, unit, thin), fontsize=8)
         if k >= len(shown) - columns:
             axes.set_xlabel("time [s]", fontsize=8)
             axes.tick_params(labelbottom=True)
@@ -75,6 +80,14 @@ def _mismatch(real: np.ndarray, simulated: np.ndarray) -> float:
     moves = both[np.isfinite(both)].std() if np.isfinite(both).any() else 0.0
     known = off[np.isfinite(off)]
     return float(np.sqrt((known**2).mean()) / moves) if len(known) and moves > 1e-9 else -1.0
+
+
+def _thin(real: np.ndarray, simulated: np.ndarray) -> bool:
+    """Whether the 90 % band is too narrow to be seen beside the whole motion."""
+    low, high = _percentiles(simulated, [5, 95])
+    seen = np.concatenate([real.ravel(), low, high])
+    known = np.isfinite(low) & np.isfinite(real).any(0)
+    return bool(known.any()) and float(np.median((high - low)[known])) < THIN * float(np.ptp(seen[np.isfinite(seen)]))
 
 
 def _percentiles(rows: np.ndarray, percent: Sequence[float]) -> np.ndarray:
@@ -116,13 +129,14 @@ def quantity(channel: str, unit: str) -> tuple[str, str]:
     return known[stream].get(unit, "velocity" if stream == "qvel" else "position"), joint
 
 
-def _axis(channel: str, unit: str) -> str:
+def _axis(channel: str, unit: str, thin: bool) -> str:
     what, joint = quantity(channel, unit)
     short = shorten([joint], 22)[0]
-    return f"{what} of\n{short}" * bool(what) + f" [{unit}]" * bool(unit)
+    from_median = ("\n" * bool(what) + "minus median") * thin
+    return f"{what} of\n{short}" * bool(what) + from_median + f" [{unit}]" * bool(unit)
 
 
-def _title(channel: str, unit: str, real: np.ndarray, simulated: np.ndarray) -> str:
+def _title(channel: str, unit: str, real: np.ndarray, simulated: np.ndarray, thin: bool) -> str:
     what, joint = quantity(channel, unit)
     name = f"{shorten([joint], 40)[0]}, {what}" if what else shorten([channel], 40)[0]
     low, high = _percentiles(simulated, [5, 95])
@@ -130,4 +144,5 @@ def _title(channel: str, unit: str, real: np.ndarray, simulated: np.ndarray) -> 
     if not known.any():
         return name
     inside = ((real >= low) & (real <= high))[known].mean()
-    return f"{name}   ({percent(inside)} inside the 90 % band)"
+    moves = f"; moves by {compact(np.nanmax(real) - np.nanmin(real), 2)} {unit}".rstrip() if thin else ""
+    return f"{name}   ({percent(inside)} inside the 90 % band{moves})"

@@ -147,7 +147,8 @@ class Session:
         if info.checks is not None:
             self.console.say(info.checks.sentence())
         if info.sets is not None:
-            self.console.say(f"product of posteriors: {info.sets.sentence()}")
+            begins = ", where the replays begin" if info.refinement is not None and info.refinement.used else ""
+            self.console.say(f"product of posteriors{begins}: {info.sets.sentence()}")
         if info.refinement is not None:
             self.console.say(f"posterior: {info.refinement.sentence()}")
             self.inference.text("BayesSim/refinement", info.refinement.sentence(), step)

@@ -17,7 +17,7 @@ from bayessim_mjx.report.look import (
     note,
     text,
 )
-from bayessim_mjx.report.words import STAGES, known_span, number, percent
+from bayessim_mjx.report.words import STAGES, known_span, number, percent, wide
 
 # what takes the squared gap down to each stage
 PARTS = {
@@ -168,8 +168,11 @@ def _links(columns: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def _total(words: str, stage: str, stages: Mapping[str, Any], level: Mapping[str, float], ci: Any) -> dict[str, Any]:
     span = known_span((ci or {}).get(stage))
+    if span is not None and wide(span):
+        span, between = None, " (wide interval)"
+    else:
+        between = f" ({number(span[0])} to {number(span[1])})" if span else ""
     ends = [(s / _largest(stages)) ** 2 for s in span] if span else [level[stage]] * 2
-    between = f" ({number(span[0])} to {number(span[1])})" if span else ""
     return {
         "x": _wrap(words, 13),
         "base": 0.0,
@@ -178,7 +181,7 @@ def _total(words: str, stage: str, stages: Mapping[str, Any], level: Mapping[str
         "total": True,
         "colour": STAGE[stage],
         "hatch": "",
-        "label": f"<b>{number(stages[stage])}</b>{'' if ends[1] <= HIGHEST else between}",
+        "label": f"<b>{number(stages[stage])}</b>{'' if span and ends[1] <= HIGHEST else between}",
         "hover": f"{words}: {number(stages[stage])}{between}",
         "error": (max(level[stage] - ends[0], 0.0), max(min(ends[1], HIGHEST) - level[stage], 0.0)),
     }

@@ -169,7 +169,7 @@ def _strongest(found: Any) -> dict[str, Any]:
             f"{found.commands[next_]} ({own[next_]:.2f})" if next_ is not None and math.isfinite(own[next_]) else "–"
         )
         rows.append((joint, found.commands[best], f"{own[best]:.2f}", other))
-    return _table(("joint", "moves with", "coherence", "next"), rows)
+    return _table(("joint", "moves with", "coherence", "next best"), rows)
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> dict[str, Any]:

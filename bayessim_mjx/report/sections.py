@@ -6,6 +6,8 @@ from typing import Any
 
 from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
+from bayessim_mjx.diagnosis.phrases.residual import parted
+from bayessim_mjx.diagnosis.phrases.verdict import chosen
 from bayessim_mjx.diagnosis.phrases.verdict import number as noise_sd
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.diagnosis.statistics import of_one
@@ -48,7 +50,7 @@ def top(d: Diagnosis, folder: Path) -> dict[str, Any]:
         "badge": verdict.badge,
         "verdict": d.verdict,
         "headline": headline(d),
-        "sentences": d.sentences[1:],
+        "sentences": parted(d)[0],
         "advice": verdict.advice,
         "command": command(d, folder),
         "tiles": [{"words": TILES[s], "colour": STAGE[s], **_tile(d, s)} for s in shown],
@@ -187,7 +189,7 @@ def _effect(e: FoundEffect) -> dict[str, Any]:
         "mark": marks.bar(e.gap_closed, e.gap_closed_ci, EFFECTS),
         "weight_mark": marks.bar(e.weight_among_rivals, None, "#9aa3ab") if finite(e.weight_among_rivals) else "",
         "predicted": percent(e.predicted_gap_closed) if finite(e.predicted_gap_closed) else "",
-        "share": percent(e.share) if finite(e.share) else "",
+        "share": percent(e.share) if finite(e.share) and percent(e.share) != percent(e.gap_closed) else "",
         "rivals": [
             {
                 "name": candidate_title(r),
@@ -205,27 +207,29 @@ def candidates(d: Diagnosis) -> dict[str, Any]:
     shown = d.candidates[:MOST_CANDIDATES]
     reach = [c["score"] + k * (c.get("se") or 0.0) for c in shown if finite(c.get("score")) for k in (-2, 2)]
     limits = marks.scale_of(reach, zero=True)
-    confirmed = {f"{e.name}@{e.where}" for e in d.effects}
-    rows = []
+    rows, answer = [], chosen(d)
     for k, c in enumerate(shown, 1):
         score, se = c.get("score"), c.get("se") or 0.0
         spans = [(score - m * se, score + m * se) for m in (2, 1)] if finite(score) and finite(se) else [None, None]
-        chosen = set(c.get("effects") or []) == confirmed and bool(confirmed)
-        colour = EFFECTS if chosen else "#5b6670"
+        colour = EFFECTS if k == answer else "#5b6670"
         rows.append(
             {
                 "rank": k,
                 "name": candidate_title(c),
                 "score": number(score),
                 "se": number(se) if se else "",
-                "chosen": chosen,
+                "chosen": k == answer,
                 "closed": closure(c.get("gap_closed")),
                 "absorbed": percent(c.get("absorbed")),
                 "values": "; ".join(_value(n, v) for n, v in _own(c).items() if n not in d.parameters),
                 "mark": marks.interval(score, spans[0], limits, colour, (0.0,), inner=spans[1]),
             }
         )
-    return {"rows": rows, "more": len(d.candidates) - len(shown), "values": any(r["values"] for r in rows)}
+    return {
+        "rows": rows,
+        "more": len(d.candidates) - len(shown),
+        "absorbed": any(finite(c.get("absorbed")) for c in shown),
+    }
 
 
 def _own(candidate: Mapping[str, Any]) -> dict[str, Any]:
@@ -264,6 +268,7 @@ def where(d: Diagnosis) -> dict[str, Any]:
             }
             for p in ranked
         ],
+        "without": parted(d)[1],
         "before": list((d.details.get("before_simulation") or {}).get("lines") or []),
         "links": [_link(x) for x in d.details.get("links") or []],
         "maps": choice(["joint"], [((j,), place_figures.maps(by_joint[j])) for j in joints]),

@@ -6,7 +6,8 @@ from typing import TextIO
 
 from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
-from bayessim_mjx.diagnosis.phrases.verdict import gap_line
+from bayessim_mjx.diagnosis.phrases.residual import parted
+from bayessim_mjx.diagnosis.phrases.verdict import chosen, gap_line
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.tables import TIE
@@ -37,11 +38,11 @@ def console(
         for warning in diagnosis.warnings:
             out.warning(warning)
         _tables(out, diagnosis, (_effects, _parameters))
-        for sentence in diagnosis.sentences[1:]:
+        for sentence in parted(diagnosis)[0]:
             out.say(f"- {sentence}")
         _tables(out, diagnosis, (_places, _candidates))
         if len(diagnosis.candidates) > BEST:
-            out.say(f"{len(diagnosis.candidates) - BEST} more candidates in diagnosis.json")
+            out.say(f"all {len(diagnosis.candidates)} candidates: diagnosis.json")
         for line in not_fitted(diagnosis, NOT_FITTED):
             out.say(f"not fitted, {line}")
         if plan := diagnosis.next_experiment:
@@ -112,8 +113,10 @@ def _places(d: Diagnosis) -> Table:
 
 
 def _candidates(d: Diagnosis) -> Table:
-    rows = []
-    for k, c in enumerate(d.candidates[:BEST], 1):
-        se = number(c.get("se")) if finite(c.get("se")) else MISSING
-        rows.append([f"{k} {candidate_title(c)}", number(c.get("score")), se, closure(c.get("gap_closed"))])
+    rows, answer = [], chosen(d)
+    for k, c in enumerate(d.candidates, 1):
+        if k <= BEST or k == answer:
+            se = number(c.get("se")) if finite(c.get("se")) else MISSING
+            mark = ", the verdict" if k == answer else ""
+            rows.append([f"{k} {candidate_title(c)}{mark}", number(c.get("score")), se, closure(c.get("gap_closed"))])
     return ["candidates", "held-out score (nats)", "standard error", "gap closed by the set"], rows, (0,)

@@ -62,13 +62,17 @@ def known_span(span: Any) -> tuple[float, float] | None:
     return (span[0], span[1]) if span is not None and all(map(finite, span)) else None
 
 
+def wide(span: tuple[float, float]) -> bool:
+    """Whether an interval is too wide for numbers."""
+    return span[1] > WIDE * max(span[0], 0.0)
+
+
 def spanned(span: Any) -> str:
     """Return the ends of an interval of a gap in brackets; one without information is called wide."""
     span = known_span(span)
     if span is None:
         return ""
-    wide = span[1] > WIDE * max(span[0], 0.0)
-    return f" (interval wider than a factor of {WIDE})" if wide else f" ({number(span[0])} – {number(span[1])})"
+    return f" (interval wider than a factor of {WIDE})" if wide(span) else f" ({number(span[0])} – {number(span[1])})"
 
 
 def number(value: Any, digits: int = 3) -> str:

@@ -45,7 +45,7 @@ def several(shares: tuple[float, float]) -> Sets:
 def test_posteriors_of_several_trajectories_are_told_as_they_are_used(tmp_path):
     fine = dataclasses.replace(found(), sets=several((1.0, 1.0)))
     text = said(fine)
-    assert "the network carries 1 of 4 trajectories" in text and "over-confident" not in text
+    assert "only 1 of 4 trajectories sharpen the posterior" in text and "over-confident" not in text
     (row,) = [line for line in text.splitlines() if line.strip().startswith("4 ")]
     assert "1.30 x" in row and "1.9" in row and row.split().count("%") == 3
     narrow = said(dataclasses.replace(fine, sets=several((1.0, 0.4))))  # half the truths' levels are 0.76

@@ -152,3 +152,13 @@ def test_a_teacher_that_sees_theta_is_imitated_by_a_student_that_does_not(toy: N
     assert play.main(["--checkpoint", str(student.path), "--episodes", "3", "--physics", "nominal"]) == 0
     assert "nominal" in capsys.readouterr().out
     assert "no such folder" in error_of(capsys, train.main, *argv, "--distil", "nowhere")
+
+
+def test_returns_have_the_digits_of_the_largest_and_a_median():
+    """`-0.0632` stood below `-400.4`, and -120 ± 130 for returns that are never positive."""
+    skewed, better = np.array([-0.0632, -400.4, -90.0]), np.array([-0.2474, -380.4, -3.0])
+    rows = play.returns_table([("nominal", skewed, np.full(3, 200.0)), ("prior", better, np.full(3, 150.0))])
+    assert rows[0] == ["nominal", "-160 ± 170", "-90.0", "-400.4", "-0.1", "200"]
+    assert rows[1][2:] == ["-3.0", "-380.4", "-0.2", "150"] and len(play.HEADER) == len(rows[0])
+    (lost,) = play.returns_table([("nominal", np.full(2, np.nan), np.ones(2))])
+    assert lost[2] == "nan"

@@ -74,7 +74,7 @@ WRONG = {
     "main --task Pendulum train": "'train' is a command of its own: bayessim-mjx train",
     "main --task brax": "--task 'brax' is unknown",
     "main --resume empty": "--resume empty: not a run folder (no run.json in it); give the folder",
-    "train --task Ant --agent tf": "--agent: invalid choice: 'tf' (choose from",
+    "train --task Ant --agent tf": "--agent 'tf' is unknown. Allowed: own, sb3, rsl_rl, skrl",
     "train --task Ant --domain none": "--domain none: allowed are nominal, prior, the folder of a run",
     "train --task Ant --checkpoint empty": "--checkpoint empty: neither a run nor a checkpoint",
     "train --task Pendulum bayessim.components=3": "bayessim.components: train has no use for it; leave it out",
@@ -91,8 +91,8 @@ WRONG = {
     "calibrate --run empty --pairs 3": "--pairs 3: at least 40",
     "gap-loop --task Pendulum": "--diagnosis is missing: give the folder that bayessim-mjx diagnose wrote",
     "gap-loop --task Pendulum --diagnosis empty --real logs": "--diagnosis empty: no diagnosis.json in it",
-    "logs": "the following arguments are required: FORMAT",
-    "logs chek logs": "FORMAT: invalid choice: 'chek' (choose from",
+    "logs": "the following arguments are required: COMMAND",
+    "logs chek logs": "COMMAND 'chek' is unknown. Did you mean check? Allowed: from-mcap,",
     "logs check none": "none: no such file or folder; allowed: a folder of logs",
     "logs check empty": "empty: no log; it holds nothing; allowed: files ending in .csv",
     "logs from-hdf5 none.h5 --out x": "none.h5: no such file or folder",
@@ -104,7 +104,7 @@ WRONG = {
     "blind --model arm.xml --out note.txt": "--out note.txt: there is a file of that name; give a folder",
     "implementations --task Nothing": "--task 'Nothing' is unknown. Allowed: Ant",
     "implementations --task Pendulum --seconds 0": "--seconds: '0': allowed: seconds, more than 0",
-    "completion ksh": "shell: invalid choice: 'ksh' (choose from",
+    "completion ksh": "shell 'ksh' is unknown. Did you mean zsh? Allowed: bash, zsh, fish",
 }
 
 

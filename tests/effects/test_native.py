@@ -69,6 +69,30 @@ def test_what_cannot_be_written_is_said_with_the_reason_and_leaves_no_trace(spec
     assert model.dof_frictionloss[0] == pytest.approx(0.3)
 
 
+@pytest.mark.parametrize("name", ["stribeck_friction", "lugre_friction"])
+def test_of_friction_that_falls_with_speed_the_level_is_written_and_the_rest_is_named(spec, name):
+    """Left out as a whole, the model for plain MuJoCo would lose most of the friction that was found."""
+    stack = [effects.make("coulomb_friction", where="all"), effects.make(name, where="first")]
+    values = {"all.coulomb_friction.level": 0.08, f"first.{name}.level": 0.17, f"first.{name}.excess": 0.04}
+    written, missing = write_model(spec, SPACE, {}, stack, values)
+    assert list(written.compile().dof_frictionloss) == pytest.approx([0.25, 0.08])
+    assert len(missing) == 1 and missing[0].startswith(f"a part of {name} at first: ") and "excess" in missing[0]
+
+
+def test_of_friction_that_differs_by_direction_the_mean_is_written(spec):
+    numbers = {"level_forward": 0.3, "level_backward": 0.1, "viscous_forward": 0.05, "viscous_backward": 0.01}
+    effect = effects.make("asymmetric_friction", where="first")
+    values = {f"first.asymmetric_friction.{number}": value for number, value in numbers.items()}
+    before = spec.compile().dof_damping[0]
+    written, missing = write_model(spec, SPACE, {}, [effect], values)
+    model = written.compile()
+    assert (model.dof_frictionloss[0], model.dof_damping[0] - before) == pytest.approx((0.2, 0.03))
+    assert missing == [
+        "a part of asymmetric_friction at first: its dependence on the direction, which MuJoCo's joints do not have; "
+        "use effects.yaml"
+    ]
+
+
 def test_masses_that_mujoco_fixes_by_their_sum_are_those_that_it_found(spec):
     spec.compiler.settotalmass = 6.0  # twice what the geoms have
     space = ParameterSpace([Parameter("mass", 1.0, 0.5, 2.0, attribute="mass", target="a", kind="body")])

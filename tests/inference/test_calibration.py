@@ -167,3 +167,30 @@ def test_pairs_from_a_proposal_are_ranked_among_draws_of_the_posterior_that_belo
     assert found.verdict == calibration.CALIBRATED
     np.testing.assert_allclose(found.contraction, 1 - 12 * np.diag(both), atol=0.02)
     assert calibration.check(jax.random.PRNGKey(2), q, truth).contraction.max() < 0.8
+
+
+def judged(narrow, wide=1.0, n=3000):
+    """Ranks of truths among posteriors whose widths are these multiples in a and in b, alone and together."""
+    rng = np.random.default_rng(0)
+    pit = np.stack([0.5 + np.clip((rng.random(n) - 0.5) / width, -0.5, 0.5) for width in (narrow, wide)], axis=1)
+    even = rng.random(n)
+    return calibration.judge(calibration.Ranks(pit, even, rng.random(n), even, np.ones((n, 2))), SPACE)
+
+
+def test_a_width_that_is_wrong_in_one_parameter_is_said_with_the_numbers_of_that_parameter():
+    """The regions of all parameters hold enough: their numbers would contradict the verdict."""
+    found = judged(0.8)
+    assert found.words == "over-confident: too narrow in a"
+    assert found.evidence().startswith("intervals of a 50 %: 40") and "HPD" not in found.evidence()
+    both = judged(0.7, 1.2)
+    assert both.words == "over-confident: too narrow in a, too wide in b"
+    assert "; intervals of b 50 %: 59" in both.evidence()
+    assert judged(0.9, 1.4).words == "under-confident: too wide in b, too narrow in a"
+    assert judged(1.0).evidence().startswith("HPD coverage 50 %: ")
+
+
+def test_the_parameter_named_beside_the_regions_errs_as_they_do():
+    """Too narrow together, and `most in` one that is too narrow, not in one that is too wide by more."""
+    p = dict.fromkeys(("a", "b", "HPD level", "TARP"), 0.5)
+    _, words, alone = calibration._verdict(("a", "b"), np.zeros(2), np.array([4.0, -9.0]), 5.0, p)
+    assert words == "over-confident: too narrow, most in a" and alone == ()

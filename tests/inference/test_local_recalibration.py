@@ -46,7 +46,7 @@ def test_sets_at_draws_of_the_posterior_take_back_what_the_network_leans_by_ther
     if truth > CORNER:
         # SD 0.1 and its eighth of a variance, in unit coordinates
         np.testing.assert_allclose(here.move, [LEANS * SD / 2, 0.0], atol=3 * SD / 2 / (COUNT * MANY) ** 0.5)
-        assert before > 0.999 and after < 0.5 and "moved back" in here.sentence()
+        assert before > 0.999 and after < 0.5 and "is moved by that bias" in here.sentence()
         again = [local_recalibration.count(*drawn(used, t), 1, here.move, here.widening(COUNT)) for t in (9, 10, 11)]
         for level in (0.5, 0.8, 0.95):  # sets that did not choose it; standard errors up to .04
             assert np.mean([a.coverage(level) for a in again]) == pytest.approx(level, abs=0.13)
@@ -112,7 +112,7 @@ def test_turns_that_end_without_an_answer_say_so(monkeypatch):
     here = local_recalibration.recalibrated(
         found, product, lambda posterior, turn: ([], np.zeros((0, 2))), components=1
     )
-    assert not here.settled and "still asked for more" in here.sentence() and here.to_dict()["settled"] is False
+    assert not here.settled and "needed more" in here.sentence() and here.to_dict()["settled"] is False
     assert here.widening(2) == local_recalibration.TURNS + 1
     monkeypatch.setattr(local_recalibration, "judged", lambda *a: (found.counts[0], None, True))
     assert local_recalibration.recalibrated(

@@ -72,7 +72,7 @@ def test_products_as_they_are_used_are_judged_with_the_widening_that_they_have(e
     assert [level for level, *_ in as_they_are.off] == [0.5, 0.8, 0.95] and last.coverage(0.5) < 0.35
     wider = product_calibration.judge(*shared, components=1, widened_by=lambda n: np.sqrt(1 + n * 0.25))
     assert not wider.off and wider.at(8).gain > last.gain and wider.at(8).coverage(0.8) == pytest.approx(0.8, abs=0.2)
-    assert exact.saturation.startswith("the network carries all 8 trajectories")
+    assert exact.saturation.startswith("each of the 8 trajectories sharpened")
     told = as_they_are.to_dict()
     assert told["carried"] == as_they_are.saturates_at and told["counts"][-1]["coverage"]["0.5"] == last.coverage(0.5)
 
@@ -93,7 +93,7 @@ def test_beyond_the_sets_that_were_judged_the_shared_error_stays(bias):
     right = np.sqrt(1 + 100 * bias**2)
     assert 0.8 * right < found.widening(100) < 1.35 * right
     at = replace(found, known=100)
-    assert f"widened {at.widening(100):.2f} times" in at.sentence() and "sets of 8 were simulated" in at.sentence()
+    assert f"widened {at.widening(100):.2f} times" in at.sentence() and "simulated sets of 8" in at.sentence()
     assert at.to_dict()["widening"] == at.widening(100) and at.to_dict()["known"] == 100
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +113,15 @@ def test_a_large_log_makes_no_large_page(tmp_path: Path, capsys: pytest.CaptureF
 def test_nothing_to_show_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert import_logs.main(["show", str(tmp_path / "nowhere")]) == 2
     assert "nowhere" in capsys.readouterr().err
+
+
+def test_a_missing_package_is_named_before_the_page_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    out = tmp_path / "show.html"
+    assert import_logs.main(["show", str(logs(tmp_path)), "--out", str(out), "--mcap", str(tmp_path / "a.mcap")]) == 2
+    assert "pip install 'bayessim-mjx[logs]'" in capsys.readouterr().err and not out.exists()
 
 
 def test_mcap_holds_every_row(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

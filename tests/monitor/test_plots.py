@@ -197,6 +197,21 @@ def test_predictive_shows_the_worst_explained_channels_first():
     assert overlaps(figure) == [] and outside(figure) == []
 
 
+def test_a_band_that_would_hide_under_the_line_is_drawn_about_the_median():
+    """A posterior of a good fit: 100 % inside of a band that nobody could see."""
+    rng, time = np.random.default_rng(0), np.linspace(0, 1, 30)
+    real = {"qpos:hinge": 4 * np.sin(3 * time), "qvel:hinge": 12 * np.cos(3 * time)}
+    simulated = {"qpos:hinge": real["qpos:hinge"] + 0.01 * rng.normal(size=(200, 30))}
+    simulated["qvel:hinge"] = real["qvel:hinge"] + 3 * rng.normal(size=(200, 30))
+    figure = plots.predictive(time, real, simulated, units={"qpos:hinge": "rad", "qvel:hinge": "rad/s"})
+    wide, thin = sorted(figure.axes, key=lambda axes: axes.get_ylabel(), reverse=True)
+    assert thin.get_ylabel() == "angle of\nhinge\nminus median [rad]" and "moves by 4 rad)" in thin.get_title(
+        loc="left"
+    )
+    assert max(map(abs, thin.get_ylim())) < 0.05 and max(map(abs, wide.get_ylim())) > 12
+    assert overlaps(figure) == [] and outside(figure) == []
+
+
 def test_predictive_of_one_channel_and_its_errors():
     time = np.arange(5.0)
     figure = plots.predictive(time, {"a": np.zeros((2, 5))}, {"a": np.ones((1, 5))})
@@ -270,7 +285,7 @@ def test_a_calibration_picture_shows_posteriors_of_several_trajectories():
     figure = plots.calibration(report_of(2), round=2, sets=sets)
     assert overlaps(figure) == [] and outside(figure) == []
     words = [text for text, _ in texts(figure)]
-    assert any("carries all 11 trajectories" in " ".join(text.split()) for text in words) and "13.0" in words
+    assert any("each of the 11 trajectories" in " ".join(text.split()) for text in words) and "13.0" in words
     assert figure.axes[2].get_xlabel() == "trajectories"
 
 
@@ -278,7 +293,9 @@ def test_predictive_axes_name_quantity_joint_and_unit():
     time = np.linspace(0, 1, 20)
     real = {f"{stream}:{joint}": np.sin(time) for stream in ("qpos", "qvel") for joint in ("elbow", "rail")}
     units = {"qpos:elbow": "rad", "qvel:elbow": "rad/s", "qpos:rail": "m", "qvel:rail": "m/s"}
-    figure = plots.predictive(time, real, {k: v + np.zeros((3, 1)) for k, v in real.items()}, units=units)
+    figure = plots.predictive(
+        time, real, {k: v + np.array([[-0.3], [0.0], [0.3]]) for k, v in real.items()}, units=units
+    )
     labels = {axes.get_ylabel().replace("\n", " ") for axes in figure.axes}
     assert labels == {
         "angle of elbow [rad]", "angular velocity of elbow [rad/s]", "position of rail [m]", "velocity of rail [m/s]",

@@ -77,7 +77,19 @@ def test_a_round_says_what_simulated_sets_asked_of_the_product(tmp_path, filmed)
     s.close()
     text = " ".join(shown.getvalue().split())
     assert "product of posteriors: with 2 trajectories standard deviations are widened 1.40 times" in text
-    assert "the network carries 1, more do not sharpen the posterior" in text
+    assert "only 1 of 2 trajectories sharpen the posterior" in text
+
+
+@pytest.mark.parametrize("used", [True, False])
+def test_a_round_says_which_posterior_is_in_use(tmp_path, filmed, used):
+    """Replays replace the product, unless they are refused: the console has a line for each."""
+    s, said = watch(tmp_path, filmed), info(0, mean=0.75)
+    s.console = Console(file=(shown := io.StringIO()))
+    said.sets = Sets((Count(1, 1.0, 1.0, 0.1, 0.5, np.full(64, 0.5)),))
+    said.refinement = types.SimpleNamespace(used=used, sentence=lambda: "as it is", to_dict=dict)
+    s.round(said, None)
+    s.close()
+    assert ("product of posteriors, where the replays begin: " in " ".join(shown.getvalue().split())) == used
 
 
 def test_videos_under_logs_show_the_newest_posterior(tmp_path, filmed):

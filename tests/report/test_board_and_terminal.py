@@ -44,7 +44,7 @@ def test_console_says_what_was_found_in_plain_lines(tmp_path):
         assert words in text
     assert "91 %; Stribeck friction · elbow 9.0 %" in text and "probability" not in text
     assert all(f"warning: {w}" in text for w in fake.full().warnings)
-    assert "3 more candidates in diagnosis.json" in text
+    assert "all 11 candidates: diagnosis.json" in text
 
 
 def test_what_was_not_fitted_is_listed_with_the_reason(tmp_path):

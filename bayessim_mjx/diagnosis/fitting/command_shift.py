@@ -76,9 +76,9 @@ class Shift:
         """Return the finding; period: s between rows of the log."""
         text = f"commands look shifted by {1e3 * self.late:+.2g} ms (+- {1e3 * self.error:.1g} ms)"
         if self.late > 0:
-            why = "they act later than the log says, by time stamps or by what drives and sensors need"
-            mend = f"if it is time stamps, `commands_late: {self.late:.4g}` beside the logs takes it out"
-            return f"{text}: {why}; a delay or lag that is named as an effect is this shift ({mend})"
+            why = "they act later than the log says. Drives and sensors need such a time, or the time stamps are late"
+            mend = f"`commands_late: {self.late:.4g}` beside the logs takes late time stamps out"
+            return f"{text}: {why}. A delay or lag among the named effects is this shift. {mend}"
         text += ": they act before their rows, which no drive does; they were moved by as much"
         between = abs(self.late / period + 0.5) < 0.15
         smooth = ", as those of samples of a smooth signal do (`hold: linear`)" if between else ""

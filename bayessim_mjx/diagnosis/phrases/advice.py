@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.diagnosis.result import Verdict as Title
 from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import percent
+
+MODEL = "model_with_effects.xml"
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ VERDICTS = {
     "effects": Verdict(
         Title.EFFECTS.words,
         "The simulator lacks effects that these logs identify.",
-        "Train with the corrected simulator: effects.yaml, or model_with_effects.xml in plain MuJoCo.",
+        f"Train with the corrected simulator: effects.yaml, or {MODEL} in plain MuJoCo.",
     ),
     "ambiguous": Verdict(
         Title.AMBIGUOUS.words,
@@ -66,6 +68,10 @@ ALIKE = Verdict(
     VERDICTS["ambiguous"].headline,
     "Randomise over all explanations, or log another motion: none was found here that separates them.",
 )
+NOT_IN_MUJOCO = (
+    f"Train with the corrected simulator: effects.yaml (docs/own_robot.md shows its use in Python). {MODEL} lacks "
+    "a part of it, which the warnings name."
+)
 PARTLY = Verdict(
     "Partly explained",
     "The named effects leave more of the gap than the tolerance.",
@@ -86,7 +92,14 @@ def verdict_of(d: Diagnosis) -> Verdict:
         return REMAINDER
     if d.verdict == "ambiguous" and d.next_experiment.get("name", "none") == "none":
         return ALIKE
+    if d.verdict == "effects" and lacks(d):
+        return replace(VERDICTS["effects"], advice=NOT_IN_MUJOCO)
     return PARTLY if d.verdict == "unexplained" and d.effects and d.gap.beyond else VERDICTS[d.verdict]
+
+
+def lacks(d: Diagnosis) -> bool:
+    """Whether the corrected model for plain MuJoCo lacks a part of the corrected simulator, or is not there."""
+    return any(text.startswith(f"{MODEL} ") for text in d.warnings)
 
 
 def headline(d: Diagnosis) -> str:
@@ -111,8 +124,10 @@ def command(d: Diagnosis, folder: str | Path) -> str:
     elif task:
         corrected = [] if d.verdict == "no_gap" else [f"effects={out / 'effects.yaml'}"]
         said += ["train", "--task", model, *corrected]
+    elif lacks(d):
+        return ""
     else:
-        shown = model if d.verdict == "no_gap" else out / "model_with_effects.xml"
+        shown = model if d.verdict == "no_gap" else out / MODEL
         said = ["python", "-m", "mujoco.viewer", f"--mjcf={shown}"]
     return shlex.join(said)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayessim_mjx.diagnosis.result import Place
+from bayessim_mjx.diagnosis.result import Diagnosis, Place
 from bayessim_mjx.diagnosis.statistics import Gap, of_one
 from bayessim_mjx.quantities import MOST, count, listed, percent
 
@@ -21,6 +21,7 @@ AXES = {
     "position": "position", "speed": "speed", "load": "gravity load", "effort": "effort", "time": "time in the log",
     "speed size": "speed", "load size": "gravity load (size)", "effort size": "effort (size)",
 }  # fmt: skip
+WITHOUT = "Without effects, "  # begins each sentence on the recalibrated simulator, before an effect is added
 OPPOSITES = ("against/with", "more/less")  # of which a number's sign chooses one
 
 
@@ -54,13 +55,22 @@ SIGNATURES = {
 }  # fmt: skip
 
 
+def parted(d: Diagnosis) -> tuple[list[str], list[str]]:
+    """Part the sentences below the first: those on the verdict, and those on the simulator without the named effects.
+
+    Where no effect is named, the second are a part of the verdict.
+    """
+    first = [text for text in d.sentences[1:] if not (d.effects and text.startswith(WITHOUT))]
+    return first, [text for text in d.sentences[1:] if text not in first]
+
+
 def located(found: Located) -> list[str]:
     """One sentence for each joint's missing force, and for each signature of a known cause.
 
     All is of the recalibrated simulator, before an effect is added, and the sentences say so.
     """
     if not found.spots:
-        return ["Without effects, the residual of the recalibrated simulator lies within the measurement noise."]
+        return [f"{WITHOUT}the residual of the recalibrated simulator lies within the measurement noise."]
     text = []
     for spot in found.spots:
         forces = [
@@ -69,9 +79,9 @@ def located(found: Located) -> list[str]:
         ]
         if spot.looked and not forces:
             forces = [f"{spot.size:.2g} {spot.unit} rms, in no simple region of the state"]
-        text += [f"Without effects, a force is missing at {spot.joint}: {'; '.join(forces)}."] if forces else []
+        text += [f"{WITHOUT}a force is missing at {spot.joint}: {'; '.join(forces)}."] if forces else []
     signs = [signature for f in found.prints if (signature := _signature(f))]
-    return text + [f"Without effects, {sign}." for sign in signs]
+    return text + [f"{WITHOUT}{sign}." for sign in signs]
 
 
 def places(found: Located) -> list[Place]:
@@ -132,7 +142,7 @@ def bracketed(value: float, low: float, high: float, unit: str) -> str:
 
 def spectra(found: Sequence[Heard]) -> list[str]:
     """Name delays, orders and lines, joint by joint, and a line that several joints share."""
-    each = [f"Without effects, {text}." for heard in found for text in _heard(heard)]
+    each = [f"{WITHOUT}{text}." for heard in found for text in _heard(heard)]
     return each + _shared(found)
 
 
@@ -140,7 +150,9 @@ def _heard(found: Heard) -> list[str]:
     says, late = [], found.late
     if late.low > 0.0:
         ms = [f"{1e3 * x:.2g}" for x in (late.value, late.low, late.high)]
-        says.append(f"the effort at {found.joint} acts {ms[0]} ms [{ms[1]}, {ms[2]}] later than commanded")
+        says.append(
+            f"the motion at {found.joint} follows the command {ms[0]} ms [{ms[1]}, {ms[2]}] later than simulated"
+        )
     missing = f"the missing force at {found.joint}"
     if found.orders:
         top = max(found.orders, key=lambda t: t["amplitude"])

@@ -43,6 +43,10 @@ WITHIN = "Every joint is within its tolerance (closest: {within})."
 PROBABLE = (
     "Probability among all fitted explanations: {own} for this one, {others}, {nothing} for the known parameters alone."
 )
+BEHIND = (
+    "The held-out score alone ranks it {rank} of {count}, {behind} nats behind the first{error}. The verdict goes by "
+    "the probability."
+)
 PAST = "The missing force depends on something else, such as the past of the motion."
 SPLITS = "To separate the explanations, run the next experiment: {name}."
 HIDDEN = "Beside {them} these logs would not show {hidden}: {their} numbers change the motion alike."
@@ -70,7 +74,7 @@ COASTS_CLOSED = " The effects close {closed} of the squared gap of such joints."
 def sentences(d: Diagnosis) -> list[str]:
     """Return the verdict, most important first; each number is one of the result's."""
     far, basis = d.gap, d.basis
-    texts = [_head(d), *_how_far(d), *_doubts(d), coasting(far, bool(d.effects)), _probable(d)]
+    texts = [_head(d), *_how_far(d), *_doubts(d), coasting(far, bool(d.effects)), _probable(d), _behind(d)]
     ambiguous = [found for found in d.answers if len(found["members"]) > 1]
     texts += [SPLITS.format(name=d.next_experiment["name"])] if any(a["splits"] for a in ambiguous) else []
     them = "it" if len(d.effects) == 1 else "them"
@@ -182,6 +186,23 @@ def _probable(d: Diagnosis) -> str:
     nothing = nothing if nothing.strip("0. %") else "less than one in a million"  # by the digits of `percent`
     others = f"{others} for its rivals together" if chance["rivals"] else "which has no rival"
     return PROBABLE.format(own=own, others=others, nothing=nothing)
+
+
+def chosen(d: Diagnosis) -> int | None:
+    """Return the rank of the named effects among the candidates, from 1; None where none is named."""
+    named = {f"{e.name}@{e.where}" for e in d.effects}
+    ranks = [k for k, c in enumerate(d.candidates, 1) if named and set(c.get("effects") or []) == named]
+    return ranks[0] if ranks else None
+
+
+def _behind(d: Diagnosis) -> str:
+    """Say where another set has the best held-out score, which the ranked candidates show."""
+    rank = chosen(d)
+    if rank in (None, 1) or not _probable(d):
+        return ""
+    first, own = d.candidates[0], d.candidates[rank - 1]
+    error = f" (standard error {first['se']:.0f})" if finite(first.get("se")) else ""
+    return BEHIND.format(rank=rank, count=len(d.candidates), behind=f"{first['score'] - own['score']:.0f}", error=error)
 
 
 def coasting(far: Gap, named: bool) -> str:

@@ -21,6 +21,7 @@ from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting import journal
 from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, one_line
 from bayessim_mjx.diagnosis.phrases import notes
+from bayessim_mjx.diagnosis.phrases.advice import MODEL
 from bayessim_mjx.diagnosis.result import Diagnosis, load, plain
 from bayessim_mjx.diagnosis.selection.numbers import Progress
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
@@ -219,7 +220,7 @@ def _short(*values: float) -> list[float]:
 # The corrected simulator as files: effects.yaml, the model for plain MuJoCo, and a URDF where it came from one
 
 
-MODEL, URDF = "model_with_effects.xml", "model_with_effects.urdf"
+URDF = "model_with_effects.urdf"
 # what a URDF has elements for: effects, and attributes of recalibrated parameters
 IN_URDF = ("coulomb_friction", "viscous_friction", "payload", "inertial_parameters")
 CALIBRATED_IN_URDF = ("damping", "friction", "mass", "inertia", "com_x", "com_y", "com_z")

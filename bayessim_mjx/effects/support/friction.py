@@ -67,6 +67,14 @@ def native(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> "Iterato
                 yield joint, own
 
 
+def lose(spec: mujoco.MjSpec, levels: dict[str, dict[str, float]]) -> None:
+    """Write dry friction, `levels[place]["level"]`: as stiff as MuJoCo allows (two timesteps), so it slips least."""
+    for joint, own in native(spec, levels):
+        if own["level"]:
+            add(joint, "frictionloss", own["level"])
+            joint.solref_friction = [2.0 * spec.option.timestep, 1.0]
+
+
 def add(joint: Any, field: str, value: float) -> None:
     """Add to a number of a spec's joint; in MuJoCo 4 some are polynomials, and the first number is the linear one."""
     number = np.array(getattr(joint, field), float)

@@ -8,7 +8,7 @@ from typing import Any
 
 import mujoco
 
-from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.effects.effect import Effect, Part
 from bayessim_mjx.effects.support.bodies import whole_inertia
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import ParameterSpace
@@ -43,7 +43,8 @@ def write_model(
         missing = [f"calibrated parameters: {error}"]
     for effect in effects:
         spec, why = _add(spec, effect, _values(effect, values or {}))
-        missing += [f"{effect.name} at {', '.join(effect.places())}: {why}"] if why else []
+        part = "a part of " if isinstance(why, Part) else ""
+        missing += [f"{part}{effect.name} at {', '.join(effect.places())}: {why}"] if why else []
     return spec, missing
 
 
@@ -52,7 +53,7 @@ def _values(effect: Effect, given: Mapping[str, float]) -> Values:
 
 
 def _add(spec: mujoco.MjSpec, effect: Effect, values: Values) -> tuple[mujoco.MjSpec, str | None]:
-    """(spec with the effect, None), or (the spec as it was, why it is not in there)."""
+    """(spec with the effect, None or the part that it lacks), or (the spec as it was, why it is not in there)."""
     new = spec.copy()
     model = whole_inertia(new, new.compile())
     at = effect.bind(model, float(model.opt.timestep), 1)  # refuses unknown places
@@ -65,7 +66,7 @@ def _add(spec: mujoco.MjSpec, effect: Effect, values: Values) -> tuple[mujoco.Mj
     except Exception as error:  # MuJoCo's, on compiling, or of the method `edit` of a user's effect
         who = "MuJoCo refuses it" if isinstance(error, ValueError) else f"its edit() fails: {type(error).__name__}"
         why = f"{who}: {' '.join(str(error).split())}"
-    return (spec, why) if why else (new, None)
+    return (spec, why) if why and not isinstance(why, Part) else (new, why)
 
 
 def _name(spec: mujoco.MjSpec, kind: str, places: Iterable[str]) -> None:

@@ -105,7 +105,7 @@ def test_a_shift_is_told_only_if_nothing_else_would_do_as_well():
 def test_the_sentence_names_size_sign_and_remedy():
     lead, late = Shift(-0.003, **SURE).sentence(PERIOD), Shift(0.005, **SURE).sentence(PERIOD)
     assert "shifted by -3 ms" in lead and "`commands_late: -0.003`" in lead and "linear" not in lead
-    assert "shifted by +5 ms" in late and "drives" in late and "moved" not in late
+    assert "shifted by +5 ms" in late and "Drives" in late and "moved" not in late
     assert "`hold: linear`" in Shift(-PERIOD / 2, **SURE).sentence(PERIOD)
 
 

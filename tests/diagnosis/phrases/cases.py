@@ -21,6 +21,10 @@ CLOSED = {"predicted": 0.66, "realised": 0.98, "elsewhere": 0.97, "nested": True
 ALONE = CLOSED | {"elsewhere": None, "nested": False}
 LEVEL = Gap(1.0, 21.4, 10.7, 0.866, 0.866, physical={"hinge": ROW}, shares=SHARES, closed=CLOSED)
 NO_EFFECTS = dataclasses.replace(LEVEL, with_effects=LEVEL.calibrated, closed={})
+RANKED = [
+    {"effects": [*labels], "score": score, "se": 151.0}
+    for labels, score in ((("gain@torque",), 2162.0), (("coulomb_friction@hinge",), 2085.0), ((), 0.0))
+]
 BASIS = {"window": 0.5, "remains": 0.0, "above_noise": True}
 
 
@@ -97,6 +101,7 @@ def every():
         "noise, white": made("noise", noise_memory=0.0),
         "noise with a memory": made("noise", noise_memory=0.06),
         "one effect": made("effects", [FRICTION], probability=chance),
+        "another set with the best score": made("effects", [FRICTION], probability=chance, candidates=RANKED),
         "two effects": made("effects", [FRICTION, GAIN], hidden=["viscous_friction@hinge"]),
         "one law at two joints": made("effects", [FRICTION, dataclasses.replace(FRICTION, where="elbow")]),
         "one log": made("effects", [FRICTION], gap(closed=ALONE, in_sample=True)),

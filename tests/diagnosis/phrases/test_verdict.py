@@ -146,6 +146,16 @@ def test_the_command_can_be_pasted(name, effects, about, experiment, words):
     assert advice.command(found, "found") == words == shlex.join(shlex.split(words))
 
 
+def test_a_model_for_mujoco_that_lacks_an_effect_is_not_advised():
+    """Nor shown by the command: what it lacks may be most of what was found."""
+    found = dataclasses.replace(made("effects", [FRICTION]), about=ABOUT | {"model": "arm.xml"})
+    assert "model_with_effects.xml in plain MuJoCo" in advice.verdict_of(found).advice
+    lacking = dataclasses.replace(found, warnings=[f"{advice.MODEL} leaves out sensor_delay at all: no such delay"])
+    assert "lacks a part of it" in advice.verdict_of(lacking).advice and advice.command(lacking, "found") == ""
+    of_task = dataclasses.replace(lacking, about=ABOUT)
+    assert advice.command(of_task, "found") == "bayessim-mjx train --task Pendulum effects=found/effects.yaml"
+
+
 def test_too_little_data_leads_to_a_check_of_the_logs():
     found = dataclasses.replace(made("no_gap"), verdict="insufficient_data", about=ABOUT | {"model": "arm.xml"})
     assert advice.command(found, "found") == "bayessim-mjx logs check 'my logs' --model arm.xml"
