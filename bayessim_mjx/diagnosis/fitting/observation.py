@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
-from bayessim_mjx.diagnosis.fitting.scales import mass_matrix
+from bayessim_mjx.diagnosis.fitting.scales import equality, mass_matrix
 from bayessim_mjx.diagnosis.logcheck.drives import DeclaredLaw
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
@@ -328,16 +328,8 @@ class Stepper:
         """Return (derivatives `[m, nv]` of the active equality constraints by the position, their values `[m]`)."""
         if not self.model.neq:
             return np.zeros((0, self.nv)), np.zeros(0)
-        data = self.checked
-        data.qpos[:] = qpos
-        mujoco.mj_fwdPosition(self.model, data)
-        own = np.flatnonzero(data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
-        J = np.zeros((data.nefc, self.nv))
-        if mujoco.mj_isSparse(self.model):
-            mujoco.mju_sparse2dense(J, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
-        else:
-            J = data.efc_J.reshape(data.nefc, self.nv)
-        return J[own].copy(), data.efc_pos[own].copy()
+        self.checked.qpos[:] = qpos
+        return equality(self.model, self.checked)
 
     def closed(self, qpos: Array, fixed: NDArray[np.bool_]) -> Array:
         """Return a position with its equality constraints met by the joints that are not `fixed` `[nv]`."""
