@@ -315,7 +315,7 @@ class Stepper:
         A constraint holds as exactly as the encoders' noise moves it.
         """
         nv = self.nv
-        J, off = self._equality(qpos)
+        J, off = equality(self.model, self.checked, qpos)
         if not len(J):
             return np.zeros((0, 2 * nv)), np.zeros(0), np.zeros(0)
         noise = np.zeros(2 * nv)
@@ -323,13 +323,6 @@ class Stepper:
         sd = np.maximum(np.concatenate([np.linalg.norm(J * n, axis=1) for n in (noise[:nv], noise[nv:])]), NUDGE)
         none = np.zeros_like(J)
         return np.block([[J, none], [none, J]]), np.concatenate([off, J @ qvel]), sd
-
-    def _equality(self, qpos: Array) -> tuple[Array, Array]:
-        """Return (derivatives `[m, nv]` of the active equality constraints by the position, their values `[m]`)."""
-        if not self.model.neq:
-            return np.zeros((0, self.nv)), np.zeros(0)
-        self.checked.qpos[:] = qpos
-        return equality(self.model, self.checked)
 
     def closed(self, qpos: Array, fixed: NDArray[np.bool_]) -> Array:
         """Return a position with its equality constraints met by the joints that are not `fixed` `[nv]`."""
@@ -340,7 +333,7 @@ class Stepper:
             there, whole = np.array(qpos, float), np.zeros(self.nv)
             whole[~fixed] = change
             mujoco.mj_integratePos(self.model, there, whole, 1.0)
-            return there, *self._equality(there)
+            return there, *equality(self.model, self.checked, there)
 
         none = np.zeros(int((~fixed).sum()))
         best = least_squares(lambda x: at(x)[2], none, jac=lambda x: at(x)[1][:, ~fixed]) if len(at(none)[2]) else None

@@ -34,7 +34,7 @@ WITHIN = (0.3, 2.0)
 # and of dry friction, which falls by half and more as a drive warms up or wears in: more of it can be an effect
 # (Coulomb friction), less can be nothing else. Not counted
 RUBS = (0.2, 1.2)
-# Iterations of Newton's solver and of its line search. Dry friction alone is solved to single precision by 4 and 6:
+# Iterations of Newton's solver and of its line search. Measured: dry friction is solved to single precision by 4 and 6;
 # with six joints, half a second, the same to 1e-7 rad as by 100 and 50, at half the time. Equality constraints are
 # quadratic, which one step solves: a four-bar moves the same bit for bit, at half the time.
 ROUNDS = 8

@@ -99,7 +99,7 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
     speed = np.maximum(_large([log.qvel for log in logs]), 1e-6)
     ptp = np.max([_span(model, log) for log in logs], axis=0)
     command = _large([log.ctrl for log in logs])
-    force, inertia = _along(model, logs)
+    force, inertia, places = _along(model, logs)
     groups = bound(model, [log.qpos[len(log) // 2] for log in logs])
     force = passed_on(force, speed, groups)
     effort = np.zeros(model.nu)
@@ -112,7 +112,6 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
         if on_joint:
             force[model.jnt_dofadr[joint]] = max(force[model.jnt_dofadr[joint]], direct * abs(gear))
     noise = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
-    places = np.concatenate([log.qpos[_some(log)] for log in logs])
     loops = drives.loops_of(model, logs)
     return Scales(
         model=model,
@@ -130,25 +129,21 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
     )
 
 
-def _some(log: Log) -> NDArray[np.int64]:
-    """Return about a hundred rows."""
-    return np.arange(0, len(log), max(1, len(log) // 100))
-
-
-def _along(model: mujoco.MjModel, logs: Sequence[Log]) -> tuple[Array, Array]:
-    """Return (forces `[nv]` that the motion needs, with loops open; mean inertia `[nv]` at each joint).
+def _along(model: mujoco.MjModel, logs: Sequence[Log]) -> tuple[Array, Array, Array]:
+    """Return (forces `[nv]` that the motion needs, with loops open; mean inertia `[nv]`; poses `[n, nq]`).
 
     Noise breaks a loop a little, and its stiff constraint would answer with forces far beyond those of the drives.
     """
     model = copy.copy(model)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
     data = mujoco.MjData(model)
-    torque, driven, inertia = [], [], []
+    torque, driven, inertia, places = [], [], [], []
     floats = np.flatnonzero(model.jnt_type[model.dof_jntid] == int(mujoco.mjtJoint.mjJNT_FREE))
     for log in logs:
         ctrl = drives.controlled(log, model) if len(floats) else log.ctrl
         acceleration = np.gradient(log.qvel, log.time, axis=0)
-        for k in _some(log):
+        for k in range(0, len(log), max(1, len(log) // 100)):
+            places.append(log.qpos[k])
             data.qpos[:], data.qvel[:], data.qacc[:] = log.qpos[k], log.qvel[k], acceleration[k]
             mujoco.mj_inverse(model, data)
             torque.append(np.abs(data.qfrc_inverse))
@@ -160,7 +155,7 @@ def _along(model: mujoco.MjModel, logs: Sequence[Log]) -> tuple[Array, Array]:
     force = np.percentile(torque, LIMITS.large, axis=0)
     if len(floats):  # a body that drag holds at a steady speed needs no force by a model without drag
         force[floats] = np.maximum(force[floats], np.percentile(driven, LIMITS.large, axis=0)[floats])
-    return force, np.mean(inertia, axis=0)
+    return force, np.mean(inertia, axis=0), np.array(places)
 
 
 def bound(model: mujoco.MjModel, poses: Sequence[Array]) -> NDArray[np.int64]:
@@ -168,8 +163,7 @@ def bound(model: mujoco.MjModel, poses: Sequence[Array]) -> NDArray[np.int64]:
     together = np.eye(model.nv, dtype=bool)
     data = mujoco.MjData(model)
     for pose in poses if model.neq else ():
-        data.qpos[:] = pose
-        J = equality(model, data)[0] != 0
+        J = equality(model, data, pose)[0] != 0
         together |= J.T @ J
     return np.asarray(connected_components(together)[1])
 
@@ -191,8 +185,11 @@ def read_by(model: mujoco.MjModel, logs: Sequence[Log], loops: Mapping[str, NDAr
     return np.asarray(out)
 
 
-def equality(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, Array]:
+def equality(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array) -> tuple[Array, Array]:
     """Return (derivatives `[m, nv]` of the active equality constraints by the position, their values `[m]`)."""
+    if not model.neq:
+        return np.zeros((0, model.nv)), np.zeros(0)
+    data.qpos[:] = qpos
     mujoco.mj_fwdPosition(model, data)
     own = np.flatnonzero(data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
     J = np.zeros((data.nefc, model.nv))
