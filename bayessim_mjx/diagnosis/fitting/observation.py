@@ -21,6 +21,7 @@ from scipy.optimize import least_squares
 
 from bayessim_mjx.compat import mass_matrix
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
+from bayessim_mjx.diagnosis.fitting.scales import equality
 from bayessim_mjx.diagnosis.logcheck.drives import DeclaredLaw
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
@@ -316,7 +317,7 @@ class Stepper:
         A constraint holds as exactly as the encoders' noise moves it.
         """
         nv = self.nv
-        J, off = self._equality(qpos)
+        J, off = equality(self.model, self.checked, qpos)
         if not len(J):
             return np.zeros((0, 2 * nv)), np.zeros(0), np.zeros(0)
         noise = np.zeros(2 * nv)
@@ -324,21 +325,6 @@ class Stepper:
         sd = np.maximum(np.concatenate([np.linalg.norm(J * n, axis=1) for n in (noise[:nv], noise[nv:])]), NUDGE)
         none = np.zeros_like(J)
         return np.block([[J, none], [none, J]]), np.concatenate([off, J @ qvel]), sd
-
-    def _equality(self, qpos: Array) -> tuple[Array, Array]:
-        """Return (derivatives `[m, nv]` of the active equality constraints by the position, their values `[m]`)."""
-        if not self.model.neq:
-            return np.zeros((0, self.nv)), np.zeros(0)
-        data = self.checked
-        data.qpos[:] = qpos
-        mujoco.mj_fwdPosition(self.model, data)
-        own = np.flatnonzero(data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
-        J = np.zeros((data.nefc, self.nv))
-        if mujoco.mj_isSparse(self.model):
-            mujoco.mju_sparse2dense(J, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
-        else:
-            J = data.efc_J.reshape(data.nefc, self.nv)
-        return J[own].copy(), data.efc_pos[own].copy()
 
     def closed(self, qpos: Array, fixed: NDArray[np.bool_]) -> Array:
         """Return a position with its equality constraints met by the joints that are not `fixed` `[nv]`."""
@@ -349,7 +335,7 @@ class Stepper:
             there, whole = np.array(qpos, float), np.zeros(self.nv)
             whole[~fixed] = change
             mujoco.mj_integratePos(self.model, there, whole, 1.0)
-            return there, *self._equality(there)
+            return there, *equality(self.model, self.checked, there)
 
         none = np.zeros(int((~fixed).sum()))
         best = least_squares(lambda x: at(x)[2], none, jac=lambda x: at(x)[1][:, ~fixed]) if len(at(none)[2]) else None

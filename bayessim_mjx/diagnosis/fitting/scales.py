@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from bayessim_mjx.compat import mass_matrix
 from bayessim_mjx.diagnosis.logcheck import drives
@@ -35,8 +37,9 @@ LIMITS = Limits()
 class Scales:
     """Per dof `[nv]`: force [N m or N], speed, travel [rad or m], inertia; per actuator `[nu]`: command, effort.
 
-    moves: `[nv]` bool, whether the joint moved by more than its noise at all; carried: `[nbody]`, kg that the robot can
-    hold at each body; period: s between the logs' rows; loops: see `drives.loops_of`.
+    moves: `[nv]` bool, whether the joint moved by more than its noise at all; read: `[nv]` bool, whether anything reads
+    the joint's encoder (a log, a servo or a declared controller); carried: `[nbody]`, kg that the robot can hold at
+    each body; period: s between the logs' rows; loops: see `drives.loops_of`.
     """
 
     model: mujoco.MjModel
@@ -47,6 +50,7 @@ class Scales:
     command: Array
     effort: Array
     moves: NDArray[np.bool_]
+    read: NDArray[np.bool_]
     carried: Array
     period: float
     loops: Mapping[str, NDArray[np.bool_]]
@@ -92,8 +96,46 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
     Args:
         rating: {body: kg} that the robot is rated to carry there.
     """
-    speed = _large([log.qvel for log in logs])
+    speed = np.maximum(_large([log.qvel for log in logs]), 1e-6)
     ptp = np.max([_span(model, log) for log in logs], axis=0)
+    command = _large([log.ctrl for log in logs])
+    force, inertia, places = _along(model, logs)
+    groups = bound(model, [log.qpos[len(log) // 2] for log in logs])
+    force = passed_on(force, speed, groups)
+    effort = np.zeros(model.nu)
+    for i in range(model.nu):
+        gear = float(model.actuator_gear[i, 0]) or 1.0
+        joint, on_joint = int(model.actuator_trnid[i, 0]), drives.dof_of(model, i) is not None
+        needed = float(force[model.jnt_dofadr[joint]]) / abs(gear) if on_joint else 0.0
+        direct = command[i] * abs(float(model.actuator_gainprm[i, 0])) if model.actuator_biasprm[i, 1] == 0 else 0.0
+        effort[i] = max(needed, direct, 1e-9)
+        if on_joint:
+            force[model.jnt_dofadr[joint]] = max(force[model.jnt_dofadr[joint]], direct * abs(gear))
+    noise = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
+    loops = drives.loops_of(model, logs)
+    return Scales(
+        model=model,
+        force=np.maximum(passed_on(force, speed, groups), 1e-9),
+        speed=speed,
+        travel=np.maximum(ptp / 2, 1e-6),
+        inertia=np.maximum(inertia, 1e-12),
+        command=np.maximum(command, 1e-9),
+        effort=effort,
+        moves=ptp > 10 * noise + 1e-9,
+        read=read_by(model, logs, loops),
+        carried=drives.carried(model, places, rating),
+        period=float(np.median([log.period for log in logs])),
+        loops=loops,
+    )
+
+
+def _along(model: mujoco.MjModel, logs: Sequence[Log]) -> tuple[Array, Array, Array]:
+    """Return (forces `[nv]` that the motion needs, with loops open; mean inertia `[nv]`; poses `[n, nq]`).
+
+    Noise breaks a loop a little, and its stiff constraint would answer with forces far beyond those of the drives.
+    """
+    model = copy.copy(model)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
     data = mujoco.MjData(model)
     torque, driven, inertia, places = [], [], [], []
     floats = np.flatnonzero(model.jnt_type[model.dof_jntid] == int(mujoco.mjtJoint.mjJNT_FREE))
@@ -110,33 +152,52 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
                 mujoco.mj_fwdActuation(model, data)
                 driven.append(np.abs(data.qfrc_actuator))
             inertia.append(np.diag(mass_matrix(model, data)))
-    command = _large([log.ctrl for log in logs])
     force = np.percentile(torque, LIMITS.large, axis=0)
     if len(floats):  # a body that drag holds at a steady speed needs no force by a model without drag
         force[floats] = np.maximum(force[floats], np.percentile(driven, LIMITS.large, axis=0)[floats])
-    effort = np.zeros(model.nu)
-    for i in range(model.nu):
-        gear = float(model.actuator_gear[i, 0]) or 1.0
-        joint, on_joint = int(model.actuator_trnid[i, 0]), drives.dof_of(model, i) is not None
-        needed = float(force[model.jnt_dofadr[joint]]) / abs(gear) if on_joint else 0.0
-        direct = command[i] * abs(float(model.actuator_gainprm[i, 0])) if model.actuator_biasprm[i, 1] == 0 else 0.0
-        effort[i] = max(needed, direct, 1e-9)
-        if on_joint:
-            force[model.jnt_dofadr[joint]] = max(force[model.jnt_dofadr[joint]], direct * abs(gear))
-    noise = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
-    return Scales(
-        model=model,
-        force=np.maximum(force, 1e-9),
-        speed=np.maximum(speed, 1e-6),
-        travel=np.maximum(ptp / 2, 1e-6),
-        inertia=np.maximum(np.mean(inertia, axis=0), 1e-12),
-        command=np.maximum(command, 1e-9),
-        effort=effort,
-        moves=ptp > 10 * noise + 1e-9,
-        carried=drives.carried(model, np.array(places), rating),
-        period=float(np.median([log.period for log in logs])),
-        loops=drives.loops_of(model, logs),
-    )
+    return force, np.mean(inertia, axis=0), np.array(places)
+
+
+def bound(model: mujoco.MjModel, poses: Sequence[Array]) -> NDArray[np.int64]:
+    """`[nv]`, a number of the group of joints that equality constraints bind to each other in these poses `[nq]`."""
+    together = np.eye(model.nv, dtype=bool)
+    data = mujoco.MjData(model)
+    for pose in poses if model.neq else ():
+        J = equality(model, data, pose)[0] != 0
+        together |= J.T @ J
+    return np.asarray(connected_components(together)[1])
+
+
+def passed_on(force: Array, speed: Array, groups: NDArray[np.int64]) -> Array:
+    """Raise forces `[nv]` in a loop: the power at one of its joints may act at each of them, at its own speed."""
+    power = np.zeros(len(force))
+    np.maximum.at(power, groups, force * speed)
+    return np.asarray(np.maximum(force, power[groups] / speed))
+
+
+def read_by(model: mujoco.MjModel, logs: Sequence[Log], loops: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """`[nv]`, whether a log, a servo or a declared controller reads the joint's encoder."""
+    out = np.any([np.zeros(model.nv, bool), *(log.seen_dofs | log.seen_speeds for log in logs)], axis=0)
+    servo = np.any(model.actuator_biasprm[:, 1:3] != 0, axis=1)
+    for i in np.flatnonzero(servo | np.any([np.zeros(model.nu, bool), *loops.values()], axis=0)):
+        if (dof := drives.dof_of(model, int(i))) is not None:
+            out[dof] = True
+    return np.asarray(out)
+
+
+def equality(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array) -> tuple[Array, Array]:
+    """Return (derivatives `[m, nv]` of the active equality constraints by the position, their values `[m]`)."""
+    if not model.neq:
+        return np.zeros((0, model.nv)), np.zeros(0)
+    data.qpos[:] = qpos
+    mujoco.mj_fwdPosition(model, data)
+    own = np.flatnonzero(data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
+    J = np.zeros((data.nefc, model.nv))
+    if mujoco.mj_isSparse(model):
+        mujoco.mju_sparse2dense(J, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
+    else:
+        J = data.efc_J.reshape(data.nefc, model.nv)
+    return J[own].copy(), data.efc_pos[own].copy()
 
 
 def _moment(model: mujoco.MjModel) -> float:

@@ -40,7 +40,7 @@ def test_no_two_links_carry_the_same_load_or_are_wrong_alike():
 def test_what_a_data_sheet_states_of_an_effect_is_gaussian():
     """5 % of a body's size, and 10 % of its inertia."""
     model = mujoco.MjModel.from_xml_string(XML)
-    scales = Scales(model, *[np.ones(1)] * 6, np.ones(1, bool), np.ones(2), 0.02, {})
+    scales = Scales(model, *[np.ones(1)] * 6, np.ones(1, bool), np.ones(1, bool), np.ones(2), 0.02, {})
     kind = load("inertial_parameters")
     effect = kind(where="link", parameters=ranges(kind, "link", scales))
     (found,) = enumerate_candidates(Physics(model, 0.02, ParameterSpace(), [effect]))

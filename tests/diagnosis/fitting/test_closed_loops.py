@@ -1,11 +1,16 @@
 """Joints without an encoder that an equality constraint binds: the constraint tells their motion."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.fitting import observation
+from bayessim_mjx.diagnosis.fitting import candidates, observation, robot, scales
 from bayessim_mjx.logs import read_logs
+from bayessim_mjx.physics import control_step
 
 FOUR_BAR = """
 <mujoco><option timestep="0.001" integrator="implicitfast"/>
@@ -73,3 +78,57 @@ def test_a_finger_follows_its_twin(tmp_path):
     left, right = log.qpos.T
     assert np.abs(right + 1.5 * left).max() < 5 * 1.5 * NOISE
     assert np.corrcoef(log.qvel.T)[0, 1] < -0.99
+
+
+def test_forces_of_a_loop_are_as_large_as_its_drive_makes_them(tmp_path):
+    """What noise breaks of a loop its stiff constraint would answer with a hundred times as much."""
+    model, log = recorded(tmp_path, MIMIC, "left")
+    drive = np.percentile(np.abs(log.ctrl), 98)
+    left, right = scales.measure(model, [log]).force
+    assert drive <= left < 1.5 * drive
+    assert right == pytest.approx(left / 1.5, rel=0.05)  # at 1.5 times the speed: the same power
+
+
+def test_joints_outside_of_a_loop_keep_their_own_forces(tmp_path):
+    """A joint that hangs beside the loop, and hardly moves."""
+    beside = '<body pos="0 0 1"><joint name="beside"/><geom fromto="0 0 0 0 0 -0.1" mass="0.01"/></body></worldbody>'
+    model = mujoco.MjModel.from_xml_string(MIMIC.replace("</worldbody>", beside))
+    force, speed = np.array([1.0, 0.1, 0.01]), np.array([1.0, 2.0, 0.1])
+    np.testing.assert_array_equal(scales.bound(model, [model.qpos0]), [0, 0, 1])
+    np.testing.assert_allclose(scales.passed_on(force, speed, np.array([0, 0, 1])), [1.0, 0.5, 0.01])
+
+
+def test_sensors_are_tried_where_something_reads_them(tmp_path):
+    """An encoder that is neither logged nor fed back changes nothing; dry friction acts at all joints of the loop."""
+    model, log = recorded(tmp_path, FOUR_BAR, "crank")
+    kinds = candidates.kinds_of(["sensor_gain", "joint_offset", "sensor_delay", "coulomb_friction"])
+    where = {e.name: e.places() for e in candidates.stack(kinds, scales.measure(model, [log]))[0]}
+    everywhere = ("crank", "coupler", "rocker")
+    assert where == dict.fromkeys(("sensor_gain", "joint_offset", "sensor_delay"), ("crank",)) | {
+        "coulomb_friction": everywhere
+    }
+    servo = FOUR_BAR.replace("</actuator>", '<position name="fed" joint="rocker" kp="1"/></actuator>')
+    assert list(scales.read_by(mujoco.MjModel.from_xml_string(servo), [], {})) == [False, False, True]
+
+
+@pytest.mark.slow
+def test_a_loop_needs_few_rounds_of_the_solver(tmp_path):
+    """The same motion as with all rounds, dry friction at every joint included."""
+    model, log = recorded(tmp_path, FOUR_BAR, "crank")
+    model.dof_frictionloss[:] = 0.05
+    few = robot.pruned(robot.robot_of(model), [log], PERIOD)
+    assert few.rounds == robot.ROUNDS
+    ends = [driven(own.physics(PERIOD)) for own in (few, dataclasses.replace(few, rounds=None))]
+    np.testing.assert_allclose(*ends, atol=2e-6)
+    assert np.ptp(ends[0][:, 0]) > 0.3
+
+
+def driven(physics):
+    """Its way in half a second, driven to and fro."""
+    world = physics.unseen(jnp.asarray(physics.space.nominal, jnp.float32), jnp.zeros(3), jnp.zeros(3))
+    step = jax.jit(lambda w, u: control_step(physics, w, jnp.full((physics.substeps, 1), u))[0])
+    way = []
+    for k in range(50):
+        world = step(world, 0.6 * np.sin(2 * np.pi * k / 30))
+        way.append(world.qpos)
+    return np.asarray(way)
