@@ -18,6 +18,7 @@ Said = dict[str, Any]
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
 AT_NOISE = 1.15  # noise sd (docs/decisions/at_noise.md)
 UNEXPLAINED = 0.15  # share left, from which on effects are no explanation (`summary.verdict.Limits.share`)
+CLEARLY = 3.0  # nats: odds of 20 (docs/decisions/relevance_and_odds.md)
 IN_UNIT = {"ms": 1e-3, "deg": math.pi / 180, "mm": 1e-3}
 
 
@@ -238,7 +239,8 @@ def _ranked(said: Said) -> Iterator[tuple[str, str]]:
     quoted = re.search(r"held-out score alone ranks it (\d+) of", text_of(said))
     if quoted and int(quoted[1]) not in ranks:
         yield "rank", f"ranks {quoted[1]}, in the table {ranks}"
-    if ranks and ranks[0] > 1 and "Probability among" in text_of(said) and not quoted:
+    behind = said["candidates"][0]["score"] - said["candidates"][ranks[0] - 1]["score"] if ranks else 0.0
+    if behind >= CLEARLY and "Probability among" in text_of(said) and not quoted:
         yield "rank", f"the most probable set is number {ranks[0]} of the table, and no sentence says so"
 
 
