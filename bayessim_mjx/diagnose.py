@@ -191,7 +191,8 @@ def _diagnose(argv: Sequence[str] | None) -> int:
         _told(f"On this robot and these logs ({missed.page}):", missed.sentences, args.headless)
     best = Path(args.out) / ("diagnosis.json" if args.verdict_only else "report.html")
     words = Verdict(result.verdict).words
-    print(f"{words} ({result.verdict}), after {duration(time.monotonic() - began)}; open {best}")
+    code = "" if words.lower() == result.verdict else f" ({result.verdict})"
+    print(f"{words}{code}, after {duration(time.monotonic() - began)}; open {best}")
     return 0
 
 

@@ -145,6 +145,7 @@ def prepare(
     tolerated = tolerances(request.tolerances, robot.mj_model)
     checked = _checked(robot, logs, request, looked)
     usable = checked.gate.usable
+    uncompared = noise.not_compared(usable)
     size = scales.measure(checked.robot.mj_model, [resample(log, checked.dt) for log in usable], robot.rating)
     kinds = candidates.kinds_of(request.effects)
     stack, left_out = candidates.stack(kinds, size)
@@ -161,7 +162,7 @@ def prepare(
     few = [*notes.conditions(len(cut.groups), cut.blocks), *notes.below_noise(allowed)]
     units = notes.inertial(checked.bases, [stand.measure(log, robot.mj_model) for log in usable])
     warnings = [*checked.notes, *units, *timed.notes, *timed.warnings, *untried, *cut.notes]
-    warnings += [*notes.not_compared(usable), *few]
+    warnings += [*uncompared, *few]
     own = Settings(screened=24) if robot.mj_model.nv > CUTTING.many else Settings()
     settings = request.settings or (QUICK if request.quick else own)
     return Setup(

@@ -193,8 +193,8 @@ def _verdict(
         return kind, f"{kind}: too {how}{where}", ()
     if odd_width:
         kind, order = (OVER, HOW) if spread[odd_width].sum() > 0 else (UNDER, HOW[::-1])
-        sides = {how: [names[i] for i in odd_width if (spread[i] > 0) == (how == "narrow")] for how in order}
-        texts = [f"too {how} in {listed(own, most=MOST)}" for how, own in sides.items() if own]
+        odd = {how: [names[i] for i in odd_width if (spread[i] > 0) == (how == "narrow")] for how in order}
+        texts = [f"too {how} in {listed(own, most=MOST)}" for how, own in odd.items() if own]
         return kind, f"{kind}: {', '.join(texts)}", tuple(odd_width)
     worst = min(p, key=lambda name: p[name])
     if p[worst] < limit / len(p):

@@ -40,11 +40,9 @@ def console(
         _tables(out, diagnosis, (_effects, _parameters))
         for sentence in parted(diagnosis)[0]:
             out.say(f"- {sentence}")
-        _tables(out, diagnosis, (_places, _candidates))
-        if len(diagnosis.candidates) > BEST:
-            out.say(f"all {len(diagnosis.candidates)} candidates: diagnosis.json")
-        for line in not_fitted(diagnosis, NOT_FITTED):
-            out.say(f"not fitted, {line}")
+        _tables(out, diagnosis, (_places,))
+        if diagnosis.verdict != "no_gap":  # shares of a gap that is noise say nothing
+            _ranking(out, diagnosis)
         if plan := diagnosis.next_experiment:
             name, why = plan.get("name", MISSING), plan.get("why", "")
             text = why if name in why or name == "none" else f"{name}: {why}"
@@ -52,6 +50,15 @@ def console(
         for path in (Path(folder) / name for name in FILES) if folder is not None else ():
             if path.exists():
                 out.say(str(path))
+
+
+def _ranking(out: Console, diagnosis: Diagnosis) -> None:
+    """Print the best candidates with the verdict, and what was not fitted."""
+    _tables(out, diagnosis, (_candidates,))
+    if len(diagnosis.candidates) > BEST:
+        out.say(f"all {len(diagnosis.candidates)} candidates: diagnosis.json")
+    for line in not_fitted(diagnosis, NOT_FITTED):
+        out.say(f"not fitted, {line}")
 
 
 def _tables(out: Console, d: Diagnosis, tables: tuple[Callable[[Diagnosis], Table], ...]) -> None:

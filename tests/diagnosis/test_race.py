@@ -76,7 +76,7 @@ def test_a_killed_search_goes_on_and_comes_to_the_same(setup, counted_whole, tmp
     (whole, cost), counted = counted_whole, itertools.count()
 
     def say(text, done, total):
-        if text == "polishing" and next(counted) == 3:
+        if text == "polishing" and next(counted) == 1:
             raise Killed
 
     simulator = setup.fitter.simulator
@@ -95,7 +95,7 @@ def test_without_time_the_first_answer_says_what_was_not_tried(setup, monkeypatc
     """The clock strikes whenever it is read: the first effect is fitted, the others have no time."""
     clock = itertools.count()
     monkeypatch.setattr(successive_halving, "EFFORT", dataclasses.replace(successive_halving.EFFORT, sets=(1,)))
-    short = searched(setup, seconds=36.0, now=lambda: float(next(clock)))
+    short = searched(setup, seconds=30.0, now=lambda: float(next(clock)))
     assert short.answer.label == SPRING and len(short.state.cut_short) == 2
     assert not_fitted(short.state) == {phrases.NO_TIME_LEFT: sorted(short.state.cut_short, key=labels(setup).index)}
     assert "2 single effects" in not_tried(short.state)["parts"]

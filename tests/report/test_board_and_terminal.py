@@ -47,6 +47,13 @@ def test_console_says_what_was_found_in_plain_lines(tmp_path):
     assert "all 11 candidates: diagnosis.json" in text
 
 
+def test_without_a_gap_no_candidate_is_ranked_on_the_terminal():
+    """`Cogging closes 45 %` stood below `No gap above the noise`."""
+    file = io.StringIO()
+    report.console(dataclasses.replace(fake.full(), verdict="no_gap", effects=[]), file=file)
+    assert "No gap" in file.getvalue() and "held-out score" not in file.getvalue()
+
+
 def test_what_was_not_fitted_is_listed_with_the_reason(tmp_path):
     labels = [f"payload@link{i}" for i in range(9)]
     found = dataclasses.replace(fake.full(), not_fitted={"no time left": labels, "no gain at first order": ["x@y"]})

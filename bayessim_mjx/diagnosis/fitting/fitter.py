@@ -245,8 +245,12 @@ class Fitter:
         (values, x), (r, which, steps) = point, found
         cost = self.cost(fit, r[0], x, values)
         gain, new = fit.cost - cost, not np.isfinite(fit.cost)
-        columns = quadratic.columns(r[0], r[1:], steps) if gain > 0 or new else r[:0]
-        return Trial(values, x, r[0], cost, gain > 0 or new, not new and gain > TRUSTED * fit.promise, which, columns)
+        better, predicted = gain > 0 or new, not new and gain > TRUSTED * fit.promise
+        if predicted or not better:
+            which, steps = (), steps[:0]
+        return Trial(
+            values, x, r[0], cost, better, predicted, which, quadratic.columns(r[0], r[1 : 1 + len(which)], steps)
+        )
 
     def _stepped(self, fit: Fit, tried: Trial) -> Fit:
         """Return the fit at a trial point where that is better, else more damped where it was."""

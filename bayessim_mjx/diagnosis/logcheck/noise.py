@@ -144,3 +144,13 @@ def _pooled(sigma: Sequence[Array], shown: Sequence[NDArray[np.bool_]]) -> tuple
     own, known = np.asarray(shown), np.any(shown, axis=0)
     counts = own | ~known
     return np.sqrt(np.sum(np.square(sigma) * counts, axis=0) / counts.sum(0)), known
+
+
+def not_compared(logs: Sequence[Log]) -> list[str]:
+    """In words, the positions that were measured but whose noise nothing tells."""
+    unknown = ~np.isfinite(noise_of_positions(logs)) & np.all([log.seen_dofs for log in logs], axis=0)
+    names = [f"qpos:{n}" for n, off in zip(logs[0].channels.qvel, unknown, strict=True) if off]
+    if not names:
+        return []
+    text = f"{', '.join(names)}: fewer than {LEVELS} values in every log tell no noise, so nothing is compared there"
+    return [f"{text}; `quantum` or `sigma` in the logs' side YAML would tell it"]

@@ -72,6 +72,11 @@ NOT_IN_MUJOCO = (
     f"Train with the corrected simulator: effects.yaml (docs/own_robot.md shows its use in Python). {MODEL} lacks "
     "a part of it, which the warnings name."
 )
+UNSOUGHT = replace(
+    ALIKE,
+    advice="Randomise over all explanations, or log another motion: a diagnosis without --quick, --minutes and "
+    "--verdict_only proposes one that separates them.",
+)
 PARTLY = Verdict(
     "Partly explained",
     "The named effects leave more of the gap than the tolerance.",
@@ -91,7 +96,7 @@ def verdict_of(d: Diagnosis) -> Verdict:
     if d.verdict == "effects" and d.gap.beyond:
         return REMAINDER
     if d.verdict == "ambiguous" and d.next_experiment.get("name", "none") == "none":
-        return ALIKE
+        return ALIKE if d.next_experiment else UNSOUGHT
     if d.verdict == "effects" and lacks(d):
         return replace(VERDICTS["effects"], advice=NOT_IN_MUJOCO)
     return PARTLY if d.verdict == "unexplained" and d.effects and d.gap.beyond else VERDICTS[d.verdict]

@@ -11,11 +11,8 @@ from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.equation_error.search import Proposal
 from bayessim_mjx.diagnosis.logcheck.drives import LEAST
 from bayessim_mjx.diagnosis.logcheck.links import Channel
-from bayessim_mjx.diagnosis.logcheck.noise import noise_of_positions
 from bayessim_mjx.diagnosis.phrases.effects import CLEAR, any_of, measured, multiplied, titled
 from bayessim_mjx.diagnosis.request import Tolerance
-from bayessim_mjx.logs.log import Log
-from bayessim_mjx.logs.signals import LEVELS
 from bayessim_mjx.odometry.base import Base
 from bayessim_mjx.odometry.stand import Stand
 from bayessim_mjx.quantities import EXACT, MOST, estimate, extent, finite, listed, number, percent
@@ -155,16 +152,6 @@ def inertial(found: Sequence[Base], stands: Sequence[Stand | None]) -> list[str]
 
 
 NO_REPEATS = "no run was repeated: these logs do not separate chance from an error of the model"
-
-
-def not_compared(logs: Sequence[Log]) -> list[str]:
-    """In words, the positions that were measured but whose noise nothing tells."""
-    unknown = ~np.isfinite(noise_of_positions(logs)) & np.all([log.seen_dofs for log in logs], axis=0)
-    names = [f"qpos:{n}" for n, off in zip(logs[0].channels.qvel, unknown, strict=True) if off]
-    if not names:
-        return []
-    text = f"{', '.join(names)}: fewer than {LEVELS} values in every log tell no noise, so nothing is compared there"
-    return [f"{text}; `quantum` or `sigma` in the logs' side YAML would tell it"]
 
 
 # The check by inverse dynamics, before any simulation, in lines: command, effort, motion, first guesses

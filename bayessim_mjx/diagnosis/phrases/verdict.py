@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 from bayessim_mjx.diagnosis.phrases import effects, residual
 from bayessim_mjx.diagnosis.phrases import effects as named
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
+from bayessim_mjx.diagnosis.selection.numbers import ODDS
 from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
 from bayessim_mjx.quantities import MOST, extent, finite, listed, percent
 
@@ -196,11 +198,13 @@ def chosen(d: Diagnosis) -> int | None:
 
 
 def _behind(d: Diagnosis) -> str:
-    """Say where another set has the best held-out score, which the ranked candidates show."""
+    """Say where another set has a clearly better held-out score, which the ranked candidates show."""
     rank = chosen(d)
     if rank in (None, 1) or not _probable(d):
         return ""
     first, own = d.candidates[0], d.candidates[rank - 1]
+    if first["score"] - own["score"] < math.log(ODDS.strong):
+        return ""
     error = f" (standard error {first['se']:.0f})" if finite(first.get("se")) else ""
     return BEHIND.format(rank=rank, count=len(d.candidates), behind=f"{first['score'] - own['score']:.0f}", error=error)
 

@@ -10,7 +10,6 @@ from bayessim_mjx.diagnosis import request
 from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.logcheck import noise
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free, noise_known
-from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Log
 from tests.diagnosis.recordings import ARM, make
@@ -50,7 +49,7 @@ def test_fewer_than_three_values_in_every_log_tell_no_noise(arm, elbows):
     assert found.sigma_q[0] == pytest.approx(SIGMA, rel=0.3) and np.isinf(found.sigma_q[1])
     assert found.spread[1] == pytest.approx(3 * found.sigma_q[0])  # as uncertain as the usual sensor leaves a start
     assert np.isfinite(found.spread).all() and (found.spread > 1e-6).all()
-    (text,) = notes.not_compared(logs)
+    (text,) = noise.not_compared(logs)
     assert text.startswith("qpos:elbow: fewer than 3 values") and "quantum" in text
     assert not noise_free(logs, 1)  # or the time step's own error would be its noise
     limit = request.judge(arm, {}, np.array([2.0, 0.0]), noise.noise_of_positions(logs)).limit
@@ -62,13 +61,13 @@ def test_noise_is_pooled_over_the_logs_that_tell_it(arm):
     logs = [swung(arm, e, f"{k}.npz") for k, e in enumerate([HELD, HELD, counts(0, 1), counts(0, 1, 2)])]
     assert [bool(noise_known(log)[1]) for log in logs] == [False, False, False, True]
     assert cut(arm, logs).sigma_q[1] == pytest.approx(SIGMA, rel=0.05)
-    assert not notes.not_compared(logs)
+    assert not noise.not_compared(logs)
 
 
 @pytest.mark.parametrize("known", [{"quantum": {"qpos:elbow": COUNT}}, {"sigma": {"elbow": SIGMA}}])
 def test_a_stated_resolution_counts(arm, known):
     stated = dataclasses.replace(swung(arm, np.full(ROWS, HELD), **known), sigma_qpos=np.array([SIGMA, SIGMA]))
-    assert cut(arm, [stated]).sigma_q[1] == pytest.approx(SIGMA) and not notes.not_compared([stated])
+    assert cut(arm, [stated]).sigma_q[1] == pytest.approx(SIGMA) and not noise.not_compared([stated])
     given = dataclasses.replace(stated, metadata={})  # by a log made in Python
     assert cut(arm, [given]).sigma_q[1] == pytest.approx(SIGMA)
 

@@ -112,6 +112,7 @@ def every():
         ),
         "a class with a number": made("ambiguous", [DELAY], experiment=run, probability=chance),
         "a class without a number": made("ambiguous", [FRICTION, PAYLOAD]),
+        "a class that no motion separates": made("ambiguous", [FRICTION, PAYLOAD], experiment={"name": "none"}),
         "unexplained": made("unexplained", flexible=FORCE | {"on": "recalibrated"}, tried=["coulomb_friction"]),
         "unexplained by chance": made("unexplained", flexible=NOTHING, not_tried=short),
         "partly": made("unexplained", [FRICTION], some, remains=0.2, flexible=FORCE),

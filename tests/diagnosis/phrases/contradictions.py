@@ -18,6 +18,7 @@ Said = dict[str, Any]
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
 AT_NOISE = 1.15  # noise sd (docs/decisions/at_noise.md)
 UNEXPLAINED = 0.15  # share left, from which on effects are no explanation (`summary.verdict.Limits.share`)
+CLEARLY = 3.0  # nats: odds of 20 (docs/decisions/relevance_and_odds.md)
 IN_UNIT = {"ms": 1e-3, "deg": math.pi / 180, "mm": 1e-3}
 
 
@@ -35,6 +36,8 @@ def contradictions(said: Said) -> list[tuple[str, str]]:
         _predicted,
         _places,
         _hidden,
+        _ranked,
+        _ways,
     )
     return [found for rule in rules for found in rule(said)]
 
@@ -227,6 +230,27 @@ def _hidden(said: Said) -> Iterator[tuple[str, str]]:
     others = [label for label in said.get("hidden") or [] if label not in members]
     if listed and len(others) < len(said["hidden"]) and len(re.split(r", | or ", listed[1])) > len(others):
         yield "hidden", f"called hidden beside the answer that it is part of: {listed[1]}"
+
+
+def _ranked(said: Said) -> Iterator[tuple[str, str]]:
+    """A verdict without a rival beside a table in which others have the better score; or another rank than there."""
+    named = {f"{e['name']}@{e['where']}" for e in said["effects"]}
+    ranks = [k for k, c in enumerate(said["candidates"], 1) if named and set(c["effects"]) == named]
+    quoted = re.search(r"held-out score alone ranks it (\d+) of", text_of(said))
+    if quoted and int(quoted[1]) not in ranks:
+        yield "rank", f"ranks {quoted[1]}, in the table {ranks}"
+    behind = said["candidates"][0]["score"] - said["candidates"][ranks[0] - 1]["score"] if ranks else 0.0
+    if behind >= CLEARLY and "Probability among" in text_of(said) and not quoted:
+        yield "rank", f"the most probable set is number {ranks[0]} of the table, and no sentence says so"
+
+
+def _ways(said: Said) -> Iterator[tuple[str, str]]:
+    """A lag of the effort, which is the command's way, where only the measurement was found late."""
+    names = {e["name"] for e in said["effects"]}
+    if any(n.startswith("sensor_") for n in names) and not any(n.startswith(("actuator_", "command_")) for n in names):
+        for sentence in said["sentences"]:
+            if re.search(r"effort at \S+ acts .* later", sentence):
+                yield "place", f"the measurement is late, but: {sentence}"
 
 
 def main(paths: list[str]) -> None:

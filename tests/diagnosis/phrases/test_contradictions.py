@@ -72,6 +72,23 @@ def test_a_number_that_changed_under_a_sentence_is_found():
     assert "interval" in {found for found, _ in contradictions(planted)}
 
 
+def test_a_verdict_behind_others_that_is_called_without_a_rival_is_found():
+    """As of a diagnosis that named the twelfth of 36 sets at 100 %."""
+    planted = said("another set with the best score")
+    planted["sentences"] = [text for text in planted["sentences"] if "held-out score alone" not in text]
+    assert "rank" in {found for found, _ in contradictions(planted)}
+    planted = said("another set with the best score")
+    planted["sentences"] = "\n".join(planted["sentences"]).replace("ranks it 2 of 3", "ranks it 1 of 3").split("\n")
+    assert "rank" in {found for found, _ in contradictions(planted)}
+
+
+def test_a_late_effort_beside_a_late_measurement_is_found():
+    planted = said("one effect")
+    planted["effects"][0]["name"] = "sensor_delay"
+    planted["sentences"].append("Without effects, the effort at hinge acts 7.1 ms [5.5, 8.7] later than commanded.")
+    assert any("late, but" in text for _, text in contradictions(planted))
+
+
 def test_a_member_of_the_answer_that_is_called_hidden_is_found():
     planted = said("two effects")
     planted["hidden"] = ["coulomb_friction@hinge"]

@@ -165,6 +165,9 @@ def test_an_experiment_is_advised_only_where_there_is_one():
     with_one, without = (made("ambiguous", [PAYLOAD], experiment=e) for e in (RUN, {}))
     assert "next experiment" in advice.verdict_of(with_one).advice
     assert "next experiment" not in advice.verdict_of(without).advice
+    assert "without --quick" in advice.verdict_of(without).advice  # nobody searched for one
+    none = made("ambiguous", [PAYLOAD], experiment={"name": "none"})
+    assert "none was found here" in advice.verdict_of(none).advice
 
 
 def test_effects_within_the_tolerance_that_explain_nothing_are_no_part_of_an_explanation():

@@ -208,8 +208,8 @@ def put(folder, files):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_written_model_finds_its_meshes_from_another_folder(layout, tmp_path, monkeypatch):
-    files, text = LAYOUTS[layout]
-    put(tmp_path / "robots", files | {"robot.xml": text})
+    beside, text = LAYOUTS[layout]
+    put(tmp_path / "robots", beside | {"robot.xml": text})
     (tmp_path / "out").mkdir()
     monkeypatch.chdir(tmp_path / "robots")
     robot = of_file("robot.xml")  # from where the user stands
