@@ -163,6 +163,13 @@ class Diagnosis:
     def __post_init__(self) -> None:
         object.__setattr__(self, "verdict", Verdict(self.verdict))
 
+    @property
+    def rank(self) -> int | None:
+        """Rank of the named effects among the candidates, from 1; None where none is named."""
+        named = {f"{e.name}@{e.where}" for e in self.effects}
+        ranks = [k for k, c in enumerate(self.candidates, 1) if named and set(c.get("effects") or []) == named]
+        return ranks[0] if ranks else None
+
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of diagnosis.json; numbers that are not finite become null."""
         out = {"schema": self.schema} | {

@@ -7,7 +7,6 @@ from typing import Any
 from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
-from bayessim_mjx.diagnosis.phrases.verdict import chosen
 from bayessim_mjx.diagnosis.phrases.verdict import number as noise_sd
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.diagnosis.statistics import of_one
@@ -207,7 +206,7 @@ def candidates(d: Diagnosis) -> dict[str, Any]:
     shown = d.candidates[:MOST_CANDIDATES]
     reach = [c["score"] + k * (c.get("se") or 0.0) for c in shown if finite(c.get("score")) for k in (-2, 2)]
     limits = marks.scale_of(reach, zero=True)
-    rows, answer = [], chosen(d)
+    rows, answer = [], d.rank
     for k, c in enumerate(shown, 1):
         score, se = c.get("score"), c.get("se") or 0.0
         spans = [(score - m * se, score + m * se) for m in (2, 1)] if finite(score) and finite(se) else [None, None]

@@ -7,7 +7,7 @@ from typing import TextIO
 from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
-from bayessim_mjx.diagnosis.phrases.verdict import chosen, gap_line
+from bayessim_mjx.diagnosis.phrases.verdict import gap_line
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.tables import TIE
@@ -120,7 +120,7 @@ def _places(d: Diagnosis) -> Table:
 
 
 def _candidates(d: Diagnosis) -> Table:
-    rows, answer = [], chosen(d)
+    rows, answer = [], d.rank
     for k, c in enumerate(d.candidates, 1):
         if k <= BEST or k == answer:
             se = number(c.get("se")) if finite(c.get("se")) else MISSING

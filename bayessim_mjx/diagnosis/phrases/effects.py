@@ -128,8 +128,12 @@ def numbered(effect: FoundEffect) -> str:
 
 
 def _numbers(effect: FoundEffect) -> str:
-    clear = [quantity(k, v) for k, v in effect.parameters.items() if _clear(effect.name, k, v)]
-    return ", ".join(f"{k} {v}" for k, v in clear)
+    """Return the numbers that are clearly away from neutral; a shape's only where the amounts that it shapes are."""
+    kind = library.known(effect.name)
+    shapes = {q.name for q in kind.quantities if q.shape} if kind else set()
+    clear = {k: quantity(k, v) for k, v in effect.parameters.items() if _clear(effect.name, k, v)}
+    sure = all(k in clear or k in shapes for k in effect.parameters)
+    return ", ".join(" ".join(text) for k, text in clear.items() if sure or k not in shapes)
 
 
 def _clear(effect: str, name: str, value: Estimate) -> bool:

@@ -190,16 +190,9 @@ def _probable(d: Diagnosis) -> str:
     return PROBABLE.format(own=own, others=others, nothing=nothing)
 
 
-def chosen(d: Diagnosis) -> int | None:
-    """Return the rank of the named effects among the candidates, from 1; None where none is named."""
-    named = {f"{e.name}@{e.where}" for e in d.effects}
-    ranks = [k for k, c in enumerate(d.candidates, 1) if named and set(c.get("effects") or []) == named]
-    return ranks[0] if ranks else None
-
-
 def _behind(d: Diagnosis) -> str:
     """Say where another set has a clearly better held-out score, which the ranked candidates show."""
-    rank = chosen(d)
+    rank = d.rank
     if rank in (None, 1) or not _probable(d):
         return ""
     first, own = d.candidates[0], d.candidates[rank - 1]

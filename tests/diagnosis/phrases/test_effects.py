@@ -91,3 +91,11 @@ def test_a_rival_and_a_parameter_at_its_end():
 def test_a_servos_gain_is_a_multiple_of_the_models():
     found = effect("servo_stiffness", "servo", 0.99, factor=(0.35, 0.0065, ""))
     assert effects.wrong(found) == "the servo stiffness (kp) at servo is 0.3500 +- 0.0065 times the model's"
+
+
+def test_the_shape_of_an_amount_that_may_be_none_is_no_number_of_the_head():
+    """The Stribeck speed was printed beside an excess of 0.09 +- 0.18 N m, which was left out."""
+    numbers = {"level": (0.2, 0.003, "N m"), "excess": (0.09, 0.18, "N m"), "speed": (0.047, 0.013, "rad/s")}
+    assert "speed" not in numbered(effect("stribeck_friction", "shoulder", **numbers))
+    numbers |= {"excess": (0.09, 0.01, "N m")}
+    assert "speed 0.047" in numbered(effect("stribeck_friction", "shoulder", **numbers))
