@@ -14,7 +14,8 @@ from tests.effects.test_friction_effects import ARM, NAMES
 def test_what_cannot_be_written_says_so():
     spec = mujoco.MjSpec.from_string(ARM)
     for name in ("stribeck_friction", "load_friction", "asymmetric_friction", "quadratic_drag"):
-        assert "use effects.yaml" in make(name, where="a").edit(spec, {"a": {}})
+        effect = make(name, where="a")
+        assert "use effects.yaml" in effect.edit(spec, {"a": {q.name: 0.1 for q in effect.quantities}})
     spring = make("joint_spring", where="a")
     assert "cubic" in spring.edit(spec, {"a": {"stiffness": 1.0, "cubic": 1.0, "rest": 0.0}})
     assert spring.edit(spec, {"all": {"stiffness": 1.0, "cubic": 0.0, "rest": np.pi}}) is None
