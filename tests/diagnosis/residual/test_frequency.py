@@ -80,7 +80,7 @@ def test_a_delay_of_the_effort_is_found():
     heard = frequency.analyse(fitter, fit)
     found, text = [h.details() for h in heard], spectra_in_words(heard)
     assert found[0]["delay"]["mean"] == pytest.approx(0.006, rel=0.12)  # s
-    assert any("later than commanded" in t for t in text)
+    assert any("later than simulated" in t for t in text)
     for key in ("coherence_real", "coherence_sim", "gain_real", "gain_sim", "phase_real_deg", "phase_sim_deg"):
         assert len(found[0][key]) == len(found[0]["hz"])
     assert found[0]["orders"] == []
