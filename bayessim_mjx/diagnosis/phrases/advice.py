@@ -14,6 +14,8 @@ from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import percent
 
 MODEL = "model_with_effects.xml"
+WHOLE = "a diagnosis without --quick, --minutes and --verdict_only"
+BELOW, NOT_BELOW = "See below where a force is missing", f"{WHOLE.capitalize()} shows where a force is missing"
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ VERDICTS = {
     "unexplained": Verdict(
         Title.UNEXPLAINED.words,
         "A part of the gap is reproducible, but no effect of the library explains it.",
-        "See below where a force is missing, and write its cause as an effect of your own (--effects file.py:Name).",
+        f"{BELOW}. Write its cause as an effect of your own (--effects file.py:Name).",
     ),
     "insufficient_data": Verdict(
         Title.INSUFFICIENT_DATA.words,
@@ -74,13 +76,12 @@ NOT_IN_MUJOCO = (
 )
 UNSOUGHT = replace(
     ALIKE,
-    advice="Randomise over all explanations, or log another motion: a diagnosis without --quick, --minutes and "
-    "--verdict_only proposes one that separates them.",
+    advice=f"Randomise over all explanations, or log another motion: {WHOLE} proposes one that separates them.",
 )
 PARTLY = Verdict(
     "Partly explained",
     "The named effects leave more of the gap than the tolerance.",
-    "Train with effects.yaml for the effects found. See below where a force is missing. Write its cause as "
+    f"Train with effects.yaml for the effects found. {BELOW}. Write its cause as "
     "an effect of your own (--effects file.py:Name), or allow more with --tolerance.",
 )
 REMAINDER = Verdict(
@@ -99,7 +100,9 @@ def verdict_of(d: Diagnosis) -> Verdict:
         return ALIKE if d.next_experiment else UNSOUGHT
     if d.verdict == "effects" and lacks(d):
         return replace(VERDICTS["effects"], advice=NOT_IN_MUJOCO)
-    return PARTLY if d.verdict == "unexplained" and d.effects and d.gap.beyond else VERDICTS[d.verdict]
+    found = PARTLY if d.verdict == "unexplained" and d.effects and d.gap.beyond else VERDICTS[d.verdict]
+    looked = d.where or d.next_experiment  # the stages that a short diagnosis leaves out
+    return found if looked else replace(found, advice=found.advice.replace(BELOW, NOT_BELOW))
 
 
 def lacks(d: Diagnosis) -> bool:

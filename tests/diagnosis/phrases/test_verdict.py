@@ -6,7 +6,7 @@ import shlex
 import pytest
 
 from bayessim_mjx.diagnosis.phrases import advice, verdict
-from bayessim_mjx.diagnosis.result import VERDICTS, Gap
+from bayessim_mjx.diagnosis.result import VERDICTS, Gap, Place
 from tests.diagnosis.phrases import cases
 from tests.diagnosis.phrases.cases import CLOSED, FRICTION, GAIN, LEVEL, PAYLOAD, gap, made
 
@@ -173,3 +173,11 @@ def test_an_experiment_is_advised_only_where_there_is_one():
 def test_effects_within_the_tolerance_that_explain_nothing_are_no_part_of_an_explanation():
     assert advice.verdict_of(made("unexplained", [GAIN])).badge == "Unexplained"
     assert advice.verdict_of(cases.every()["partly"]).badge == "Partly explained"
+
+
+def test_what_stands_below_is_promised_only_where_it_was_looked_for():
+    """As of `--quick`, which leaves out where the gap lies and the next experiment."""
+    short = made("unexplained")
+    assert "shows where a force is missing" in advice.verdict_of(short).advice
+    whole = dataclasses.replace(short, where=[Place("hinge", 1.0, (0.9, 1.0), "at rest")])
+    assert advice.verdict_of(whole).advice.startswith("See below where a force is missing")
