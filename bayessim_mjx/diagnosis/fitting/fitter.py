@@ -38,7 +38,7 @@ class Trial:
     Attributes:
         values: `[k]`; offsets: `[W, s]`; r: `[W, n]`, residuals; cost.
         better: whether it is better than where the fit is; predicted: whether it gains what the columns promised.
-        which: columns that were differenced anew; columns: `[W, n, k]`, at this point, or where the fit stays there.
+        which: columns that were differenced anew, at a better point; columns: `[W, n, k]`, these.
     """
 
     values: Array
@@ -98,11 +98,9 @@ class Fitter:
 
     def start_columns(self, theta: Array, offsets: Array, r: Array) -> Array:
         """B `[W, n, s]` at theta."""
-        s = offsets.shape[1]
         h = quadratic.RULES.change * self.spread
-        moved = offsets[None] + (np.eye(s) * h)[:, None, :]
-        shifted = self.whiten(self.simulator.run(np.repeat(theta[None], s, 0), moved))
-        return quadratic.columns(r, shifted, h)
+        moved = offsets[None] + np.diag(h)[:, None, :]
+        return quadratic.columns(r, self.whiten(self.simulator.run(np.repeat(theta[None], len(h), 0), moved)), h)
 
     def begin(
         self, coordinates: Sequence[Coordinate], values: Array | None = None, offsets: Array | None = None
@@ -130,12 +128,12 @@ class Fitter:
 
     def anew(self, fit: Fit) -> Fit:
         """All columns anew where the fit is, by one-sided differences: a step that is refused needs no better ones."""
-        theta, k, s = self.vector(fit.coordinates, fit.values), len(fit.values), len(self.spread)
-        steps, h = fit.inward(fit.values, fit.steps()), quadratic.RULES.change * self.spread
-        thetas = [*self._shifts(fit, fit.values, range(k), steps), *[theta] * s]
-        moved = np.concatenate([np.repeat(fit.offsets[None], k, 0), fit.offsets[None] + (np.eye(s) * h)[:, None, :]])
-        r = self.whiten(self.simulator.run(np.stack(thetas), moved))
-        A, B = quadratic.columns(fit.r, r[:k], steps), quadratic.columns(fit.r, r[k:], h)
+        theta, steps = self.vector(fit.coordinates, fit.values), fit.inward(fit.values, fit.steps())
+        A, B = fit.A, self.start_columns(theta, fit.offsets, fit.r)
+        if len(steps):
+            thetas = np.stack(self._shifts(fit, fit.values, range(len(steps)), steps))
+            r = self.whiten(self.simulator.run(thetas, np.repeat(fit.offsets[None], len(thetas), 0)))
+            A = quadratic.columns(fit.r, r, steps)
         return replace(fit, A=A, B=B, history=(*fit.history, fit.cost), damping=Fit.damping, reach=np.ones(1))
 
     def cost(self, fit: Fit, r: Array, offsets: Array, values: Array) -> float:
@@ -190,9 +188,12 @@ class Fitter:
                 return now
             asked = {i: list(fresh(now[i])) for i in running}
             for i, tried in self._tried(now, trial, asked).items():
-                astray = i in old and not tried.better
-                now[i] = self.anew(now[i]) if astray else self._stepped(now[i], tried)
-                old = old - {i} if astray else old | {i} if tried.better else old
+                if tried.better or i not in old:
+                    now[i] = self._stepped(now[i], tried)
+                    old |= {i} if tried.better else set()
+                else:
+                    now[i] = self.anew(now[i])
+                    old -= {i}
                 now[i], trial[i] = self._propose(now[i])
             running = [i for i in running if not settled(now[i], tolerance)]
             running = running if keep is None else keep(made, now, running)

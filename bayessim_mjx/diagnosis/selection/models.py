@@ -74,7 +74,7 @@ def _innovations(fitter: Fitter, fit: Fit, moves: Array, plain: Array) -> Array:
             themselves.
     """
     rest, costs, group = _rest(fitter, fit), plain.copy(), fitter.simulator.windows.group
-    for name, move, alone in zip(np.unique(group), moves, told_alone(fitter, fit), strict=True):
+    for name, move, alone in zip(np.unique(group), moves, told_alone(fitter, fit, rest), strict=True):
         if not alone:
             own = group == name
             H = rest.curvature(own)[1]
@@ -82,9 +82,12 @@ def _innovations(fitter: Fitter, fit: Fit, moves: Array, plain: Array) -> Array:
     return costs
 
 
-def told_alone(fitter: Fitter, fit: Fit) -> list[bool]:
-    """Of each condition, whether it alone tells a parameter of an effect (a limit that is reached there only)."""
-    tells = _rest(fitter, fit).told_by(np.arange(len(fitter.base), len(fit.coordinates)))
+def told_alone(fitter: Fitter, fit: Fit, rest: Rest | None = None) -> list[bool]:
+    """Of each condition, whether it alone tells a parameter of an effect (a limit that is reached there only).
+
+    rest: `_rest` of the fit, where it is known.
+    """
+    tells = (rest or _rest(fitter, fit)).told_by(np.arange(len(fitter.base), len(fit.coordinates)))
     group = fitter.simulator.windows.group
     return [tells(group == name) for name in np.unique(group)]
 
