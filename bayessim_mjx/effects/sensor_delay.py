@@ -64,7 +64,7 @@ class SensorDelay(Effect):
         now, lag = columns(at, **measurement), memory["history"].shape[0]
         past = jnp.where(memory["fresh"], now, memory["history"])
         steps = jnp.clip(at.values(theta)[:, 0] / jnp.float32(at.dt), 0.0, lag)
-        shown, history = delayed(past, now, steps, at.dt)
+        shown, history = delayed(past, now, steps, at)
         memory = {"history": history, "fresh": jnp.zeros((), bool)}
         return memory, written(at, **measurement, values=shown)
 

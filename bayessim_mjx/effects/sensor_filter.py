@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.effects.effect import Effect, Measurement, Quantity
-from bayessim_mjx.effects.support.motion import Motion
+from bayessim_mjx.effects.support.motion import Motion, bend
 from bayessim_mjx.effects.support.site import Site, columns, written
 
 if TYPE_CHECKING:
@@ -18,7 +18,8 @@ _SHORTEST = 1e-3  # of a control step: below it the exponential is 0 in float32 
 
 @dataclasses.dataclass(frozen=True)
 class SensorFilter(Effect):
-    """T y' = q - y, shown is y; likewise the velocity. Exact for constant acceleration in each control step.
+    """T y' = q - y, shown is y; likewise the velocity. Exact for an acceleration that changes linearly in each control
+    step (the angle: for a constant one).
 
     An episode begins settled (y = q). One that starts in the middle of a log has y = measured, q = y + T y'.
 
@@ -64,8 +65,10 @@ class SensorFilter(Effect):
         # y(t + dt) = q1 - T/dt (1 - a) (q1 - q0) + a (y - q0), a = exp(-dt / T), q from q0 to q1 in a line
         line = now - ratio * passed * (now - before) + (1.0 - passed) * (output - before)
         # and the parabola's part: (w1 - w0) T (T/dt (1 - a) - (1 + a) / 2)
-        bend = at.values(theta) * (ratio * passed - 1.0 + 0.5 * passed) * (now - before)[:, 1:]
-        shown = line.at[:, :1].add(bend)
+        parabola = at.values(theta) * (ratio * passed - 1.0 + 0.5 * passed) * (now - before)[:, 1:]
+        # and of velocities c s (1 - s): c (T/dt (1 + a) - 2 (T/dt)^2 (1 - a))
+        faster = ratio * (2.0 - passed) - 2.0 * ratio**2 * passed
+        shown = line + jnp.concatenate([parabola, faster * bend(before, now, at)[:, None]], 1)
         memory = {"input": now, "output": shown, "fresh": jnp.zeros((), bool)}
         return memory, written(at, **measurement, values=shown)
 

@@ -52,7 +52,7 @@ class SensorPackets(Packets, Effect):
         past = jnp.where(memory["fresh"], now, memory["history"])
         age = jnp.minimum(delay / jnp.float32(at.dt), memory["age"] + 1.0)
         age = jnp.clip(jnp.where(gone, memory["age"] + 1.0, age), 0.0, lag)
-        shown, history = delayed(past, now, jnp.broadcast_to(age, (len(at),)), at.dt)
+        shown, history = delayed(past, now, jnp.broadcast_to(age, (len(at),)), at)
         if self.lost == "zero":
             shown = jnp.where(gone[:, None], 0.0, shown)
         shown = jnp.where(jnp.any(values != 0, axis=1, keepdims=True), shown, now)

@@ -13,13 +13,13 @@ from flax import struct
 
 from bayessim_mjx.compat import mjx
 from bayessim_mjx.effects.support.motion import Motion
-from bayessim_mjx.effects.support.site import under_tendon_limit
+from bayessim_mjx.effects.support.site import early, under_tendon_limit
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.physics.controllers import Drive
 from bayessim_mjx.physics.gates import chained_in
 from bayessim_mjx.physics.model import PARTS, Physics, World, state_of
 from bayessim_mjx.physics.pushed import Memory, apart, together
-from bayessim_mjx.physics.timestep import early, substep
+from bayessim_mjx.physics.timestep import substep
 
 
 def control_step(

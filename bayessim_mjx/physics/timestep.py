@@ -26,19 +26,6 @@ STAGES = ((0.5, 1 / 3, -0.25), (0.5, 1 / 3, -0.25), (1.0, 1 / 6, 1.0))
 _NO_DAMPING = int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
 
 
-def staggered(model: mujoco.MjModel) -> bool:
-    """Whether the integrator is read best as a leapfrog: velocities, and what acts, half a timestep before positions.
-
-    So it is where positions move with the new velocities (Euler, implicitfast); RK4 has all of them at one time.
-    """
-    return int(model.opt.integrator) != RK4
-
-
-def early(model: mujoco.MjModel) -> float:
-    """s, by which the integrator's velocities lie before its positions, read as a leapfrog."""
-    return 0.5 * float(model.opt.timestep) if staggered(model) else 0.0
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Timestep:
     """What does not change during one timestep of one world.

@@ -165,12 +165,23 @@ def path(qpos, qvel, times):
     return qpos[k] + slope * s - bend / 2 * s * (DT - s)
 
 
+def speed(qpos, qvel, times):
+    """Velocity at `times` when the acceleration is linear in every control step and the steps' mean velocities fit.
+
+    Semi-implicit Euler's velocities are those of half a timestep, 2.5 ms, before. The first one is held before.
+    """
+    k = np.clip(np.floor(times / DT + 1e-9).astype(int), 0, len(qpos) - 2)
+    s = np.clip(times / DT - k, 0, None)
+    mean = np.diff(qpos)[k] / DT - 0.0025 * np.diff(qvel)[k] / DT
+    return np.interp(times, ROWS, qvel) + 6 * (mean - (qvel[k] + qvel[k + 1]) / 2) * s * (1 - s)
+
+
 @pytest.mark.parametrize("delay", [0.005, 0.02, 0.031, 0.05])
 def test_delay_shows_the_past(full, delay):
     true, seen = shown(full, {}), shown(full, {"b.sensor_delay.delay": delay})
     x, v = (y[:, 1] for y in true)
     np.testing.assert_allclose(seen[0][:, 1], path(x, v, ROWS - delay), atol=3e-6)
-    np.testing.assert_allclose(seen[1][:, 1], np.interp(ROWS - delay, ROWS, v), atol=3e-6)
+    np.testing.assert_allclose(seen[1][:, 1], speed(x, v, ROWS - delay), atol=3e-5)
     for x, y in zip(true, seen, strict=True):
         assert np.array_equal(x[:, 0], y[:, 0])
 
@@ -180,9 +191,9 @@ def test_filter_is_the_exact_low_pass(full, constant):
     """Against scipy's simulation of T y' = q - y on a fine grid, settled at the first value."""
     true, seen = shown(full, {}), shown(full, {"b.sensor_filter.time_constant": constant})
     (q, v), a, fine = (x[:, 1] for x in true), 1 / constant, DT / 50 * np.arange(50 * STEPS + 1)
-    for x, y, inner in zip(true, seen, (path(q, v, fine), np.interp(fine, ROWS, v)), strict=True):
+    for x, y, inner in zip(true, seen, (path(q, v, fine), speed(q, v, fine)), strict=True):
         low = inner if constant < 1e-5 else inner[0] + lsim(([a], [1, a]), inner - inner[0], fine)[1]
-        np.testing.assert_allclose(y[:, 1], low[::50], atol=2e-4 if constant < 1e-5 else 1e-5)
+        np.testing.assert_allclose(y[:, 1], low[::50], atol=2e-4 if constant < 1e-5 else 3e-5)
         assert np.array_equal(x[:, 0], y[:, 0])
 
 
@@ -257,7 +268,7 @@ def test_a_start_in_the_middle_goes_on_as_the_recording(full, continued, case):
         jnp.asarray(theta_of(full, values)), Motion(*arrays, start=start), jnp.asarray(command[10 + start :])
     )
     np.testing.assert_allclose(qpos, logged[0][11 + start :], atol=tolerance)
-    np.testing.assert_allclose(qvel, logged[1][11 + start :], atol=20 * tolerance)
+    np.testing.assert_allclose(qvel, logged[1][11 + start :], atol=25 * tolerance)
 
 
 @pytest.mark.parametrize("case", [c for c in CASES if c in NAMES])

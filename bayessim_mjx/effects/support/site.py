@@ -17,6 +17,19 @@ _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
+def staggered(model: mujoco.MjModel) -> bool:
+    """Whether the integrator is read best as a leapfrog: velocities, and what acts, half a timestep before positions.
+
+    So it is where positions move with the new velocities (Euler, implicitfast); RK4 has all of them at one time.
+    """
+    return int(model.opt.integrator) != int(mujoco.mjtIntegrator.mjINT_RK4)
+
+
+def early(model: mujoco.MjModel) -> float:
+    """s, by which the integrator's velocities lie before its positions, read as a leapfrog."""
+    return 0.5 * float(model.opt.timestep) if staggered(model) else 0.0
+
+
 class Carried(Protocol):
     """What an effect, or its class, says of the elements that can carry it."""
 
@@ -79,6 +92,11 @@ class Site:
     def dt(self) -> float:
         """Control step, s."""
         return self.timestep * self.substeps
+
+    @property
+    def early(self) -> float:
+        """s, by which the integrator's velocities lie before its positions (`early`)."""
+        return early(self.mj_model)
 
     def __len__(self) -> int:
         return len(self.names)
