@@ -36,17 +36,26 @@ class Weighed:
         weight: {explanation: probability}; nats: {explanation: log of evidence and prior over those of the known
             parameters alone}. numbers: {set: free numbers of its effects}.
         sets: {set: probability}, every one by itself.
+        excess: {set: held-out squared error above the noise, in noise variances}.
     """
 
     weight: Mapping[Key, float]
     nats: Mapping[Key, float]
     numbers: Mapping[Key, int]
     sets: Mapping[Key, float]
+    excess: Mapping[Key, float]
 
     @property
     def answer(self) -> Key:
-        """Of the sets that are as likely as the most likely one (`Odds.mention`), that with the fewest numbers."""
-        return min(self._within(ODDS.mention), key=lambda k: (len(k), self.numbers[k], -self.weight[k], sorted(k)))
+        """Of the sets that are as likely as the most likely one (`Odds.mention`), that with the fewest numbers.
+
+        No effects that leave a relevant gap which others of them close: their evidence may rest on one of `doubts`, such
+        as a late sensor, that no simulator gets.
+        """
+        likely = self._within(ODDS.mention)
+        least = min(likely, key=self.excess.__getitem__)
+        closing = [k for k in likely if not k or self.excess[k] <= _limit(self.excess, least)]
+        return min(closing, key=lambda k: (len(k), self.numbers[k], -self.weight[k], sorted(k)))
 
     @property
     def beside(self) -> list[Key]:
@@ -79,9 +88,14 @@ def core(key: Key, excess: Mapping[Key, float]) -> Key:
     Args:
         excess: {set: held-out squared error above the noise, in noise variances}, of all sets that were fitted.
     """
-    limit = excess[key] + RELEVANCE.noise + RELEVANCE.share * max(excess[BASE], 0.0)
+    limit = _limit(excess, key)
     enough = [k for k in excess if k <= key and excess[k] <= limit]
     return min(enough, key=lambda k: (len(k), excess[k], sorted(k)))
+
+
+def _limit(excess: Mapping[Key, float], key: Key) -> float:
+    """The most that leaves no relevant part of the gap more than a set."""
+    return excess[key] + RELEVANCE.noise + RELEVANCE.share * max(excess[BASE], 0.0)
 
 
 def weighed(
@@ -93,7 +107,7 @@ def weighed(
     for key, nats in total.items():
         of.setdefault(core(key, own), []).append(nats - total[BASE])
     explained = {k: float(logsumexp(each)) for k, each in of.items()}
-    return Weighed(_shares(explained), dict(explained), numbers, _shares(total))
+    return Weighed(_shares(explained), dict(explained), numbers, _shares(total), own)
 
 
 def _shares(nats: Mapping[Key, float]) -> dict[Key, float]:
@@ -185,7 +199,7 @@ class Weighing:
     def settled(self, key: Key) -> bool:
         """Whether a set of effects leaves nothing that matters."""
         left = self.excess([key, BASE])
-        return bool(key) and left[key] <= RELEVANCE.noise + RELEVANCE.share * max(left[BASE], 0.0)
+        return bool(key) and left[key] <= _limit({**left, key: 0.0}, key)
 
     def total(self, key: Key) -> float:
         """Log of evidence and prior over those of the known parameters alone."""

@@ -58,3 +58,11 @@ def test_of_explanations_that_are_as_likely_the_simpler_one_is_named():
     found = weighed({NONE: 0.0, A: 51.4, B: 50.0}, excess, numbers)  # of 4
     assert found.answer == A and found.beside == [B]
     assert weighed({NONE: 0.0, A: 53.2, B: 50.0}, excess, numbers).beside == []  # of 25
+
+
+def test_effects_that_leave_a_gap_are_not_named_for_likely_ones_that_close_it():
+    """A joint's offset whose fit has the sensor 1.6 ms late as an error of the clock, and the same with a delay."""
+    evidence = {NONE: 0.0, A: 50.0, AB: 50.0 - log_prior(frozenset("b"), 30)}
+    assert weighed(evidence, {NONE: 100.0, A: 7.3, AB: 0.0}).answer == AB
+    assert weighed(evidence, {NONE: 100.0, A: 0.3, AB: 0.0}).answer == A
+    assert weighed({NONE: 0.0, A: 1.0 - log_prior(A, 30)}, {NONE: 7.3, A: 0.0}).answer == NONE

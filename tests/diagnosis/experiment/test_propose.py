@@ -90,7 +90,7 @@ def contest():
 def concluded(pool, answer):
     """A selection that names the answer, and holds all that were fitted for equally likely."""
     even = dict.fromkeys(pool.models, 1 / len(pool.models))
-    weighed = Weighed(even, dict.fromkeys(pool.models, 0.0), {}, even)
+    weighed = Weighed(even, dict.fromkeys(pool.models, 0.0), {}, even, {})
     shares = {"subsets": {}, "promised": (0.0, {}), "chosen": {}, "elsewhere": float("nan")}
     nothing = {"hidden": (), "stand_ins": {}, "rivals": {}, "estimated": None, "force": None}
     return Selection(pool, answer, weighed=weighed, **shares, **nothing)
