@@ -205,7 +205,11 @@ class Search:
         if not starts:
             return
         fit = state.fitter.refresh(state.fitter.derive(cut_back(state, model, kept), case.coordinates, starts[0]))
-        self._likelier({frozenset(e.label for e in (*kept, case)): scored(state.fitter, fit, (*kept, case))})
+        key = frozenset(e.label for e in (*kept, case))
+        self._likelier({key: scored(state.fitter, fit, (*kept, case))})
+        apart = 0.5 * float(np.sum((fit.r - model.fit.r) ** 2))  # nats: what the logs would tell of two such models
+        if key in self.weighing.scored and apart < np.log(ODDS.mention):
+            self.weighing.special[frozenset(e.label for e in model.effects)] = key
 
     def _likelier(self, models: Mapping[Key, Model]) -> None:
         """Take models in the place of those of the same effects, where they are likelier."""

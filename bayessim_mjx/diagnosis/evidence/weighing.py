@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -99,13 +100,21 @@ def _limit(excess: Mapping[Key, float], key: Key) -> float:
 
 
 def weighed(
-    evidence: Mapping[Key, float], excess: Mapping[Key, float], numbers: Mapping[Key, int], candidates: int
+    evidence: Mapping[Key, float],
+    excess: Mapping[Key, float],
+    numbers: Mapping[Key, int],
+    candidates: int,
+    special: Mapping[Key, Key] = MappingProxyType({}),
 ) -> Weighed:
-    """Return the posterior; `evidence` and `excess` (see `core`) have the empty set, the known parameters alone."""
+    """Return the posterior; `evidence` and `excess` (see `core`) have the empty set, the known parameters alone.
+
+    special: {set: the same with a special case in the place of a law whose further numbers are neutral}: one model.
+    """
     total = {k: e + log_prior(k, candidates) for k, e in evidence.items()}
     own, of = {k: excess[k] for k in evidence}, dict[Key, list[float]]()
     for key, nats in total.items():
-        of.setdefault(core(key, own), []).append(nats - total[BASE])
+        needed = core(key, own)
+        of.setdefault(special.get(needed, needed), []).append(nats - total[BASE])
     explained = {k: float(logsumexp(each)) for k, each in of.items()}
     return Weighed(_shares(explained), dict(explained), numbers, _shares(total), own)
 
@@ -144,7 +153,7 @@ class Weighing:
 
     Attributes:
         scored: {set: its model with its evidence}; D: `[W, n, nv m]`, effect of forces on the windows
-            (`disturbance.columns`), at the fit of the known parameters.
+            (`disturbance.columns`), at the fit of the known parameters. special: as in `weighed`.
     """
 
     def __init__(self, state: SearchState) -> None:
@@ -154,6 +163,7 @@ class Weighing:
         self.D = disturbance.columns(fitter, state.base.fit, disturbance.default_nodes(fitter), self.scale)
         self.channels = int(fitter.used.sum())
         self.scored: dict[Key, Scored] = {}
+        self.special: dict[Key, Key] = {}
         self.doubts = doubts.found(fitter, self.D, state.base.fit.B)
         self.score([BASE])
 
@@ -220,7 +230,7 @@ class Weighing:
 
     def _weighed(self, nats: dict[Key, float]) -> Weighed:
         numbers = {k: sum(len(e.coordinates) for e in s.model.effects) for k, s in self.scored.items()}
-        return weighed(nats, self.excess(self.scored), numbers, len(self.state.candidates))
+        return weighed(nats, self.excess(self.scored), numbers, len(self.state.candidates), self.special)
 
 
 def _without(of: Scored, kept: NDArray[np.bool_], sizes: bool = True) -> float:

@@ -66,3 +66,11 @@ def test_effects_that_leave_a_gap_are_not_named_for_likely_ones_that_close_it():
     assert weighed(evidence, {NONE: 100.0, A: 7.3, AB: 0.0}).answer == AB
     assert weighed(evidence, {NONE: 100.0, A: 0.3, AB: 0.0}).answer == A
     assert weighed({NONE: 0.0, A: 1.0 - log_prior(A, 30)}, {NONE: 7.3, A: 0.0}).answer == NONE
+
+
+def test_a_law_with_neutral_numbers_counts_for_its_special_case():
+    """Stribeck friction without an excess is Coulomb friction, however likely its fit is."""
+    evidence, excess = {NONE: 0.0, A: 50.0, B: 53.0}, {NONE: 100.0, A: 0.0, B: 0.0}
+    found = weighing.weighed(evidence, excess, {NONE: 0, A: 1, B: 3}, 30, {B: A})
+    assert found.answer == A and B not in found.weight and found.weight[A] == pytest.approx(1.0)
+    assert found.nats[A] - found.nats[NONE] == pytest.approx(np.logaddexp(50.0, 53.0) + log_prior(A, 30))
