@@ -267,9 +267,10 @@ class Estimated:
 
 
 def at_its_mean(weighing: Weighing, key: Key) -> Model:
-    """Return the model at its posterior mean, held-out estimates refitted; where it was if that is no better place.
+    """Return the model at its posterior mean, held-out estimates refitted; where it was if that is no place as good.
 
-    A mean far from the fit is the step of a linear model: from there it is looked for again.
+    A mean far from the fit is the step of a linear model: from there it is looked for again. Of a product of two
+    numbers that the logs do not tell apart (a payload's mass and lever) the means are not the product.
     """
     fitter, state, old = weighing.state.fitter, weighing.state, weighing.scored[key]
     low, high = (np.array([getattr(c, end) for c in old.model.fit.coordinates]) for end in ("low", "high"))
@@ -283,9 +284,9 @@ def at_its_mean(weighing: Weighing, key: Key) -> Model:
         moved = fitter.refresh(replace(here.model.fit, values=mean, history=()))
         state.models[key] = scored(fitter, moved, old.model.effects)
         weighing.score([key])
-    else:
-        if weighing.scored[key].found.nats < old.found.nats - np.log(ODDS.mention):
-            state.models[key], weighing.scored[key] = old.model, old
+    worse = np.mean(weighing.scored[key].model.fit.r ** 2 - old.model.fit.r**2) > RELEVANCE.noise
+    if worse or weighing.scored[key].found.nats < old.found.nats - np.log(ODDS.mention):
+        state.models[key], weighing.scored[key] = old.model, old
     state.models[key] = model = heldout.refitted(fitter, state.models[key])
     weighing.scored[key] = replace(weighing.scored[key], model=model)
     return model
