@@ -27,9 +27,9 @@ from bayessim_mjx.diagnosis.selection.numbers import PRIORS
 from bayessim_mjx.diagnosis.statistics import Z90, mixture_quantiles
 
 Array = NDArray[np.float64]
-# Shares of the nominal value that are summed over: from a seventh of the prior's accuracy to 100 %; 13 of them change
-# quantiles by less than 1 % of the interval against 49.
-LEVELS = np.geomspace(0.01, 1.0, 13)
+# Shares of the nominal value that are summed over: from a seventh of the prior's accuracy to 100 %; 9 of them change
+# quantiles by .3 % of the interval against 49 (19 of 20; all by less than 1.5 %), the evidence by less than .04 nats.
+LEVELS = np.geomspace(0.01, 1.0, 9)
 ENDS = tuple(map(float, ndtr([-Z90, 0.0, Z90])))  # of a 90 % interval, and its middle
 
 
