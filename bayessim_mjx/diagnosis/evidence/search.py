@@ -65,6 +65,7 @@ class Search:
                 break
             self._fit(self._todo(best), "around the new leading set", TOGETHER)  # it led in none of the rounds
             self._leading()
+        self._smaller()
         self._at_one_place()
         self._possible()
         return self.weighing.weighed()
@@ -167,6 +168,17 @@ class Search:
             polish(self.state, [self.state.models[k] for k in some], self.say)
             self._polished |= set(some)
             self.weighing.score(some)
+
+    def _smaller(self) -> None:
+        """The leading set without each of its effects, from where it came to rest.
+
+        A smaller set was fitted from elsewhere and may rest far off (a payload's mass and lever), so that a further
+        effect seemed to be needed.
+        """
+        best = self._order()[0]
+        plans = [Plan(best - {x}, np.inf, best) for x in sorted(best) if len(best) > 1]
+        if plans and not self.state.settings.budget.over(LEAVING_OUT):
+            self._fit(plans, "dropping", LEAVING_OUT)
 
     def _possible(self) -> None:
         """Add to the answer one effect that may do the work of a known parameter.
