@@ -209,3 +209,22 @@ def test_ground_is_moved_in_the_world_whatever_is_turned_above_it():
     for model, d in zip(models, data, strict=True):
         mujoco.mj_kinematics(model, d)
     np.testing.assert_allclose(data[1].geom_xpos - data[0].geom_xpos, [[0.1, -0.2, 0.3], [0] * 3, [0] * 3], atol=1e-12)
+
+
+@pytest.mark.parametrize("first", ["joint_offset", "sensor_gain", "sensor_filter"])
+def test_two_sensors_of_one_joint_both_act(first):
+    """A late sensor shows what the one before it does; alone it would show the joint."""
+    rig = arm()
+    sensor, late = hidden(rig, first, 0.05, sign=1.0), hidden(rig, "sensor_delay", 0.04)
+    plants = [Plant(rig, {}, causes) for causes in ([sensor], [sensor, late], [late])]
+    shown = []
+    for plant in plants:
+        plant.reset(np.array([0.3]), np.zeros(1), np.zeros(1))
+        rows = []
+        for k in range(30):
+            plant.advance(np.array([np.sin(k * rig.period * 5)]))
+            rows.append(np.concatenate(plant.measure()))
+        shown.append(np.array(rows))
+    alone, both, bare = shown
+    np.testing.assert_allclose(both[2:], alone[:-2], atol=1e-12)  # 40 ms are two periods
+    assert np.abs(both - bare).max() > 5e-3

@@ -117,7 +117,7 @@ class Cause:
         """Add forces of this sub-step to `plant.data`."""
 
     def watch(self, plant: Simulated, q: np.ndarray, v: np.ndarray) -> None:
-        """See the true joint positions and velocities at the end of a sub-step."""
+        """See positions and velocities at the end of a sub-step, as the causes before this one show them."""
 
     def sense(self, plant: Simulated, q: np.ndarray, v: np.ndarray) -> None:
         """Change the measured positions and velocities of a row in place."""

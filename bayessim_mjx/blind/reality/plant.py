@@ -153,7 +153,7 @@ class Plant:
         self.data.qpos[self._q], self.data.qvel[self._v] = q, v
         for cause in self.causes:
             cause.reset(self, command)
-            cause.watch(self, q, v)
+        self._seen(q.copy(), v.copy())
         mujoco.mj_forward(self.model, self.data)
 
     def resume(self, run: Run, row: int) -> None:
@@ -179,9 +179,13 @@ class Plant:
                 cause.force(self)
             self.data.ctrl[:] = u
             self.move(1)
-            seen = self.link()
-            for cause in self.stepped:
-                cause.watch(self, *seen)
+            self._seen(*self.link())
+
+    def _seen(self, q: np.ndarray, v: np.ndarray) -> None:
+        """Sensors that remember see what those before them show: two at one joint both act."""
+        for cause in self.causes:
+            cause.watch(self, q, v)
+            cause.sense(self, q, v)
 
     def move(self, count: int) -> None:
         """So many steps under the commands and forces that are in `data`."""
