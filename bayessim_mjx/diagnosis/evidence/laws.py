@@ -98,6 +98,14 @@ def _said(effect: str, attribute: str) -> Any:
     return getattr(load(effect), attribute, ()) if effect in names() else ()
 
 
+def neutral_beyond(case: Candidate, law: Candidate, values: Array) -> bool:
+    """Whether a law with these numbers is its special case: what acts in it beyond the case's numbers is neutral."""
+    own = {c.name.rsplit(".", 1)[1] for c in case.coordinates}
+    pairs = list(zip(law.coordinates, law.shapes, values, strict=True))
+    more = [(c, v) for c, shape, v in pairs if not shape and c.name.rsplit(".", 1)[1] not in own]
+    return len(more) < len(pairs) - sum(law.shapes) and all(v == c.neutral for c, v in more)
+
+
 def as_large(one: Candidate, other: Candidate, values: Array) -> tuple[Array, ...]:
     """Return a law's numbers at another's values of the same units, in their order; neutral where there are none.
 

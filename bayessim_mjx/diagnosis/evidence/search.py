@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.evidence.laws import (
     as_large,
     inertia,
+    neutral_beyond,
     related,
     same_lateness,
     special_case,
@@ -220,7 +221,8 @@ class Search:
         key = frozenset(e.label for e in (*kept, case))
         self._likelier({key: scored(state.fitter, fit, (*kept, case))})
         apart = 0.5 * float(np.sum((fit.r - model.fit.r) ** 2))  # nats: what the logs would tell of two such models
-        if key in self.weighing.scored and apart < np.log(ODDS.mention):
+        same = neutral_beyond(case, law, model.values_of(law)) or apart < np.log(ODDS.mention)
+        if key in self.weighing.scored and same:
             self.weighing.special[frozenset(e.label for e in model.effects)] = key
 
     def _likelier(self, models: Mapping[Key, Model]) -> None:

@@ -1,9 +1,11 @@
 """A special case begins as large as it is in the effect that contains it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.evidence.laws import related, special_case
+from bayessim_mjx.diagnosis.evidence.laws import neutral_beyond, related, special_case
 from bayessim_mjx.diagnosis.evidence.search import as_large
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 
@@ -55,3 +57,14 @@ def test_a_payload_and_a_wrong_inertia_of_one_body_are_tried_in_each_others_plac
     assert not related(payload, candidate("armature", where="lower"))  # of a joint with the body's name
     stribeck, coulomb = (candidate(f"{n}_friction", where="lower") for n in ("stribeck", "coulomb"))
     assert related(coulomb, stribeck) and related(stribeck, coulomb) and not related(coulomb, payload)
+
+
+@pytest.mark.parametrize(("excess", "one"), [(0.0, True), (0.1, False)])
+def test_a_law_whose_further_numbers_are_neutral_is_its_special_case(excess, one):
+    """Whatever the speed is at which an excess that is none would fall."""
+    coulomb = candidate("coulomb_friction", ("level", 2.0, "N m"))
+    shaped = replace(STRIBECK, shapes=np.array([False, False, True]))
+    assert neutral_beyond(coulomb, shaped, np.array([0.7, excess, 0.3])) == one
+    limit = candidate("actuator_saturation", ("inverse_limit", 1.0, "1/(N m)"))  # no number in common
+    curve = candidate("speed_torque_limit", ("inverse_stall", 1.0, "1/(N m)"), ("inverse_speed", 1.0, "s/rad"))
+    assert not neutral_beyond(limit, curve, np.zeros(2))
