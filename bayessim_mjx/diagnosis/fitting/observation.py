@@ -17,11 +17,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from bayessim_mjx.compat import mass_matrix
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
-from bayessim_mjx.diagnosis.fitting.scales import equality
+from bayessim_mjx.diagnosis.fitting.loops import NUDGE, Way, closed, equality, followed
 from bayessim_mjx.diagnosis.logcheck.drives import DeclaredLaw
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
@@ -29,9 +28,6 @@ from bayessim_mjx.odometry import base
 from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
-# rad or m, rad/s or m/s, of finite differences in doubles: the cube root of their precision balances the rounding of
-# central ones with their third order. No state is known better
-NUDGE = float(np.finfo(float).eps ** (1 / 3))
 SIZES = (
     0.3,
     0.03,
@@ -84,16 +80,6 @@ def completed(logs: Sequence[Log], model: mujoco.MjModel) -> tuple[tuple[Log, ..
     return tuple(log if way is None else _with(log, way, model) for log, way in zip(logs, ways, strict=True)), ()
 
 
-@dataclass(frozen=True, eq=False)
-class Way:
-    """A smoothed motion: qpos `[T, nq]`, qvel `[T, nv]`, sd `[T, 2 nv]` and `known [2 nv]`, see `_gained`."""
-
-    qpos: Array
-    qvel: Array
-    sd: Array
-    known: Array
-
-
 def _with(log: Log, way: Way, model: mujoco.MjModel) -> Log:
     """Guesses in the place of what was not measured; its noise is the typical error of the guess."""
     nv = model.nv
@@ -111,7 +97,9 @@ def _with(log: Log, way: Way, model: mujoco.MjModel) -> Log:
 
 
 def _smoothed(log: Log, model: mujoco.MjModel) -> Way:
-    """Return the best of some sizes of what the model lacks."""
+    """Return the best of some sizes of what the model lacks; where constraints tell the motion, no model is needed."""
+    if (bound := followed(model, log, np.repeat(PRIOR, model.nv))) is not None:
+        return bound
     stepper = Stepper(model, log)
     measured = _Measured.of(log)
     lacking = _accelerations(model, log)
@@ -160,7 +148,7 @@ class _Filter:
         seen = np.concatenate([log.seen_dofs, log.seen_dofs | log.seen_speeds])
         noise = np.maximum(np.concatenate([log.sigma_dofs, log.sigma_qvel]), NUDGE)
         self.prior = np.where(seen, np.minimum(3 * noise, np.repeat(PRIOR, nv)), np.repeat(PRIOR, nv))
-        self._run(stepper.closed(log.qpos[0], seen[:nv]), np.where(seen[nv:], log.qvel[0], 0.0))
+        self._run(closed(stepper.model, stepper.checked, log.qpos[0], seen[:nv]), np.where(seen[nv:], log.qvel[0], 0.0))
         qpos, qvel, _ = self._back()
         self._run(qpos[0], qvel[0])  # from the smoothed start: it is linearised there
 
@@ -325,21 +313,6 @@ class Stepper:
         sd = np.maximum(np.concatenate([np.linalg.norm(J * n, axis=1) for n in (noise[:nv], noise[nv:])]), NUDGE)
         none = np.zeros_like(J)
         return np.block([[J, none], [none, J]]), np.concatenate([off, J @ qvel]), sd
-
-    def closed(self, qpos: Array, fixed: NDArray[np.bool_]) -> Array:
-        """Return a position with its equality constraints met by the joints that are not `fixed` `[nv]`."""
-        if not self.model.neq or fixed.all():
-            return np.array(qpos, float)
-
-        def at(change: Array) -> tuple[Array, Array, Array]:
-            there, whole = np.array(qpos, float), np.zeros(self.nv)
-            whole[~fixed] = change
-            mujoco.mj_integratePos(self.model, there, whole, 1.0)
-            return there, *equality(self.model, self.checked, there)
-
-        none = np.zeros(int((~fixed).sum()))
-        best = least_squares(lambda x: at(x)[2], none, jac=lambda x: at(x)[1][:, ~fixed]) if len(at(none)[2]) else None
-        return at(none if best is None else best.x)[0]
 
     def linearised(self, qpos: Array, qvel: Array, row: int, span: float | None = None) -> tuple[Array, Array, Array]:
         """`advanced`, and its derivatives by the state `[2 nv, 2 nv]`."""

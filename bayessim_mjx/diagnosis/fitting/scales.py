@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from bayessim_mjx.compat import mass_matrix
+from bayessim_mjx.diagnosis.fitting.loops import equality
 from bayessim_mjx.diagnosis.logcheck import drives
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.site import element_names, floating
@@ -183,21 +184,6 @@ def read_by(model: mujoco.MjModel, logs: Sequence[Log], loops: Mapping[str, NDAr
         if (dof := drives.dof_of(model, int(i))) is not None:
             out[dof] = True
     return np.asarray(out)
-
-
-def equality(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array) -> tuple[Array, Array]:
-    """Return (derivatives `[m, nv]` of the active equality constraints by the position, their values `[m]`)."""
-    if not model.neq:
-        return np.zeros((0, model.nv)), np.zeros(0)
-    data.qpos[:] = qpos
-    mujoco.mj_fwdPosition(model, data)
-    own = np.flatnonzero(data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
-    J = np.zeros((data.nefc, model.nv))
-    if mujoco.mj_isSparse(model):
-        mujoco.mju_sparse2dense(J, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
-    else:
-        J = data.efc_J.reshape(data.nefc, model.nv)
-    return J[own].copy(), data.efc_pos[own].copy()
 
 
 def _moment(model: mujoco.MjModel) -> float:
