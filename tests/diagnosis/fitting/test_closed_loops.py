@@ -63,7 +63,9 @@ def rocker_of(crank):
     return np.arctan2(way[..., 0], way[..., 1]) + inner
 
 
-def test_the_loop_of_a_four_bar_tells_its_other_angles(tmp_path):
+def test_the_loop_of_a_four_bar_tells_its_other_angles(tmp_path, monkeypatch):
+    """By its geometry: no model of masses and friction has to be right for it."""
+    monkeypatch.setattr(observation, "Stepper", None)
     model, log = recorded(tmp_path, FOUR_BAR, "crank")
     crank, rocker = log.qpos[:, 0], log.qpos[:, 2]
     assert rocker_of(np.zeros(())) == pytest.approx(0, abs=1e-9)
