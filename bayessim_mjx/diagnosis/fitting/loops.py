@@ -47,6 +47,33 @@ def equality(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array) -> tuple[A
     return J[own].copy(), data.efc_pos[own].copy()
 
 
+def followers(model: mujoco.MjModel, poses: Array, first: NDArray[np.bool_]) -> dict[int, int]:
+    """{dof: another that it moves with at a ratio that is the same in all poses `[n, nq]`}, one of `first` if there is.
+
+    A gear, a belt, a finger's second joint: a force at one of both moves the robot as one at the other does.
+    """
+    if not model.neq:
+        return {}
+    data, out = mujoco.MjData(model), dict[int, int]()
+    ways = np.array([_free(equality(model, data, pose)[0]) for pose in poses])  # [n, nv, nv]
+    order = np.argsort(~first, kind="stable").tolist()
+    for k, lead in enumerate(order):
+        own = ways[:, lead]
+        size = np.sum(own**2, axis=1)
+        if lead in out or size.min() < NUDGE:
+            continue
+        for other in order[k + 1 :]:
+            ratio = np.median(np.sum(ways[:, other] * own, axis=1) / size)
+            if abs(ratio) > NUDGE and np.abs(ways[:, other] - ratio * own).max() < NUDGE:
+                out[other] = lead
+    return out
+
+
+def _free(J: Array) -> Array:
+    """Projection `[nv, nv]` onto velocities that constraints with these derivatives allow."""
+    return np.asarray(np.eye(J.shape[1]) - np.linalg.pinv(J) @ J)
+
+
 def closed(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array, fixed: NDArray[np.bool_]) -> Array:
     """Return a position with its equality constraints met by the joints that are not `fixed` `[nv]`; data: scratch."""
     if not model.neq or fixed.all():

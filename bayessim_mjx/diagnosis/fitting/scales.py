@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from bayessim_mjx.compat import mass_matrix
-from bayessim_mjx.diagnosis.fitting.loops import equality
+from bayessim_mjx.diagnosis.fitting.loops import equality, followers
 from bayessim_mjx.diagnosis.logcheck import drives
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.site import element_names, floating
@@ -40,7 +40,7 @@ class Scales:
 
     moves: `[nv]` bool, whether the joint moved by more than its noise at all; read: `[nv]` bool, whether anything reads
     the joint's encoder (a log, a servo or a declared controller); carried: `[nbody]`, kg that the robot can hold at
-    each body; period: s between the logs' rows; loops: see `drives.loops_of`.
+    each body; period: s between the logs' rows; loops: see `drives.loops_of`; follows: see `loops.followers`.
     """
 
     model: mujoco.MjModel
@@ -55,6 +55,7 @@ class Scales:
     carried: Array
     period: float
     loops: Mapping[str, NDArray[np.bool_]]
+    follows: Mapping[int, int] = field(default_factory=dict)
 
     def at(self, kind: str, place: str) -> dict[str, float]:
         """{word of `Quantity.per`: scale} at one place."""
@@ -114,6 +115,7 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
             force[model.jnt_dofadr[joint]] = max(force[model.jnt_dofadr[joint]], direct * abs(gear))
     noise = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
     loops = drives.loops_of(model, logs)
+    read = read_by(model, logs, loops)
     return Scales(
         model=model,
         force=np.maximum(passed_on(force, speed, groups), 1e-9),
@@ -123,10 +125,11 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
         command=np.maximum(command, 1e-9),
         effort=effort,
         moves=ptp > 10 * noise + 1e-9,
-        read=read_by(model, logs, loops),
+        read=read,
         carried=drives.carried(model, places, rating),
         period=float(np.median([log.period for log in logs])),
         loops=loops,
+        follows=followers(model, places, read),
     )
 
 

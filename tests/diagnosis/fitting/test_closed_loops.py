@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.fitting import candidates, observation, robot, scales
+from bayessim_mjx.diagnosis.fitting import candidates, loops, observation, robot, scales
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.physics import control_step
 
@@ -111,6 +111,18 @@ def test_sensors_are_tried_where_something_reads_them(tmp_path):
     }
     servo = FOUR_BAR.replace("</actuator>", '<position name="fed" joint="rocker" kp="1"/></actuator>')
     assert list(scales.read_by(mujoco.MjModel.from_xml_string(servo), [], {})) == [False, False, True]
+
+
+def test_joints_that_move_as_one_are_one_place_for_forces(tmp_path):
+    """At 1.5 times the speed friction of a twin is that of the finger, larger: named where the encoder is."""
+    model, log = recorded(tmp_path, MIMIC, "left")
+    found = scales.measure(model, [log])
+    assert found.follows == {1: 0}
+    kinds = candidates.kinds_of(["coulomb_friction", "joint_offset"])
+    assert [e.places() for e in candidates.stack(kinds, found)[0]] == [("left",), ("left",)]
+    bar = mujoco.MjModel.from_xml_string(FOUR_BAR)
+    poses = [loops.closed(bar, mujoco.MjData(bar), np.array([x, 0, 0]), np.arange(3) < 1) for x in (-0.2, 0.0, 0.2)]
+    assert loops.followers(bar, np.array(poses), np.arange(3) < 1) == {}
 
 
 @pytest.mark.slow
