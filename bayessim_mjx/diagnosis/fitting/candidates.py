@@ -167,7 +167,7 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
 
 
 def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:
-    """Joints that moved, and not only with others; sensors that are read; contacts that are on; declared controllers."""
+    """Joints that moved, not only with others; sensors that are read; contacts that are on; declared controllers."""
     model = scales.model
     if kind.loop:
         return bool(scales.loops[kind.loop][element_names(model, "actuator").index(place)])
