@@ -163,7 +163,10 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
         )
         if found or not kind.floats:
             without.setdefault(why, []).append(kind.name)
-    return tuple(made), [f"{', '.join(names)}: {why}" for why, names in without.items()]
+    names = [scales.model.joint(int(j)).name for j in scales.model.dof_jntid]
+    pairs = [(names[i], names[k]) for i, k in scales.follows.items()]
+    one = [f"forces at {i}: it moves with {k} at a fixed ratio, so {k} stands for both" for i, k in pairs]
+    return tuple(made), [*(f"{', '.join(names)}: {why}" for why, names in without.items()), *one]
 
 
 def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:

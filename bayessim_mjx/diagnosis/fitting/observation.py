@@ -20,14 +20,17 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.compat import mass_matrix
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
-from bayessim_mjx.diagnosis.fitting.loops import NUDGE, Way, closed, equality, followed
 from bayessim_mjx.diagnosis.logcheck.drives import DeclaredLaw
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.odometry import base
 from bayessim_mjx.physics import controllers
+from bayessim_mjx.physics.loops import Loops
 
 Array = NDArray[np.float64]
+# rad or m, rad/s or m/s, of finite differences in doubles: the cube root of their precision balances the rounding of
+# central ones with their third order. No state is known better
+NUDGE = float(np.finfo(float).eps ** (1 / 3))
 SIZES = (
     0.3,
     0.03,
@@ -80,6 +83,16 @@ def completed(logs: Sequence[Log], model: mujoco.MjModel) -> tuple[tuple[Log, ..
     return tuple(log if way is None else _with(log, way, model) for log, way in zip(logs, ways, strict=True)), ()
 
 
+@dataclass(frozen=True, eq=False)
+class Way:
+    """A motion: qpos `[T, nq]`, qvel `[T, nv]`, sd `[T, 2 nv]` and `known [2 nv]`, see `_gained`."""
+
+    qpos: Array
+    qvel: Array
+    sd: Array
+    known: Array
+
+
 def _with(log: Log, way: Way, model: mujoco.MjModel) -> Log:
     """Guesses in the place of what was not measured; its noise is the typical error of the guess."""
     nv = model.nv
@@ -98,8 +111,11 @@ def _with(log: Log, way: Way, model: mujoco.MjModel) -> Log:
 
 def _smoothed(log: Log, model: mujoco.MjModel) -> Way:
     """Return the best of some sizes of what the model lacks; where constraints tell the motion, no model is needed."""
-    if (bound := followed(model, log, np.repeat(PRIOR, model.nv))) is not None:
-        return bound
+    noise, prior = np.concatenate([log.sigma_dofs, log.sigma_qvel]), np.repeat(PRIOR, model.nv)
+    if (bound := Loops(model).followed(log.qpos, log.qvel, noise, log.seen_dofs)) is not None:
+        known = (prior / np.maximum(bound[2].max(0), NUDGE)) ** 2 - 1
+        if (known > 1).all():
+            return Way(*bound, known)
     stepper = Stepper(model, log)
     measured = _Measured.of(log)
     lacking = _accelerations(model, log)
@@ -148,7 +164,7 @@ class _Filter:
         seen = np.concatenate([log.seen_dofs, log.seen_dofs | log.seen_speeds])
         noise = np.maximum(np.concatenate([log.sigma_dofs, log.sigma_qvel]), NUDGE)
         self.prior = np.where(seen, np.minimum(3 * noise, np.repeat(PRIOR, nv)), np.repeat(PRIOR, nv))
-        self._run(closed(stepper.model, stepper.checked, log.qpos[0], seen[:nv]), np.where(seen[nv:], log.qvel[0], 0.0))
+        self._run(stepper.loops.closed(log.qpos[0], seen[:nv]), np.where(seen[nv:], log.qvel[0], 0.0))
         qpos, qvel, _ = self._back()
         self._run(qpos[0], qvel[0])  # from the smoothed start: it is linearised there
 
@@ -268,7 +284,7 @@ class Stepper:
     def __init__(self, model: mujoco.MjModel, log: Log) -> None:
         self.model, self.log, self.nv = copy.copy(model), log, int(model.nv)
         self.data, self.longest = mujoco.MjData(self.model), float(model.opt.timestep)
-        self.checked = mujoco.MjData(self.model)  # for constraints: the stepped one keeps its actuators
+        self.loops = Loops(self.model)  # with data of its own: the stepped one keeps its actuators
         declared = controllers.declared(log.metadata)
         source = str(log.metadata.get("source", log.name))
         law = controllers.read(log.metadata, model, log.actuators, source) if declared else None
@@ -305,7 +321,7 @@ class Stepper:
         A constraint holds as exactly as the encoders' noise moves it.
         """
         nv = self.nv
-        J, off = equality(self.model, self.checked, qpos)
+        J, off = self.loops.at(qpos)
         if not len(J):
             return np.zeros((0, 2 * nv)), np.zeros(0), np.zeros(0)
         noise = np.zeros(2 * nv)

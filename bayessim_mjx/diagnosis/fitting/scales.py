@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from bayessim_mjx.compat import mass_matrix
-from bayessim_mjx.diagnosis.fitting.loops import equality, followers
 from bayessim_mjx.diagnosis.logcheck import drives
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.site import element_names, floating
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import Parameter, geometry
+from bayessim_mjx.physics.loops import Loops
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class Scales:
 
     moves: `[nv]` bool, whether the joint moved by more than its noise at all; read: `[nv]` bool, whether anything reads
     the joint's encoder (a log, a servo or a declared controller); carried: `[nbody]`, kg that the robot can hold at
-    each body; period: s between the logs' rows; loops: see `drives.loops_of`; follows: see `loops.followers`.
+    each body; period: s between the logs' rows; loops: see `drives.loops_of`; follows: see `Loops.followers`.
     """
 
     model: mujoco.MjModel
@@ -129,7 +129,7 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
         carried=drives.carried(model, places, rating),
         period=float(np.median([log.period for log in logs])),
         loops=loops,
-        follows=followers(model, places, read),
+        follows=Loops(model).followers(places, read),
     )
 
 
@@ -164,10 +164,9 @@ def _along(model: mujoco.MjModel, logs: Sequence[Log]) -> tuple[Array, Array, Ar
 
 def bound(model: mujoco.MjModel, poses: Sequence[Array]) -> NDArray[np.int64]:
     """`[nv]`, a number of the group of joints that equality constraints bind to each other in these poses `[nq]`."""
-    together = np.eye(model.nv, dtype=bool)
-    data = mujoco.MjData(model)
+    together, loops = np.eye(model.nv, dtype=bool), Loops(model)
     for pose in poses if model.neq else ():
-        J = equality(model, data, pose)[0] != 0
+        J = loops.at(pose)[0] != 0
         together |= J.T @ J
     return np.asarray(connected_components(together)[1])
 

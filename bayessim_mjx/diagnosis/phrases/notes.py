@@ -52,12 +52,6 @@ def rows(period: float, timestep: float, dt: float, fastest: bool) -> list[str]:
     return []
 
 
-def one_motion(names: Sequence[str], follows: Mapping[int, int]) -> list[str]:
-    """Say which joints move with others at a fixed ratio (see `loops.followers`); names: of the model's dofs."""
-    text = "at a fixed ratio: logs do not tell at which of both a force acts; it is named at"
-    return [f"{names[i]} moves with {names[k]} {text} {names[k]}" for i, k in follows.items()]
-
-
 def conditions(count: int, one_log: bool) -> list[str]:
     """Say that few operating conditions were logged."""
     if one_log:

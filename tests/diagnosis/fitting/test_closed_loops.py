@@ -8,9 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.fitting import candidates, loops, observation, robot, scales
+from bayessim_mjx.diagnosis.fitting import candidates, observation, robot, scales
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.physics import control_step
+from bayessim_mjx.physics.loops import Loops
 
 FOUR_BAR = """
 <mujoco><option timestep="0.001" integrator="implicitfast"/>
@@ -121,8 +122,9 @@ def test_joints_that_move_as_one_are_one_place_for_forces(tmp_path):
     kinds = candidates.kinds_of(["coulomb_friction", "joint_offset"])
     assert [e.places() for e in candidates.stack(kinds, found)[0]] == [("left",), ("left",)]
     bar = mujoco.MjModel.from_xml_string(FOUR_BAR)
-    poses = [loops.closed(bar, mujoco.MjData(bar), np.array([x, 0, 0]), np.arange(3) < 1) for x in (-0.2, 0.0, 0.2)]
-    assert loops.followers(bar, np.array(poses), np.arange(3) < 1) == {}
+    crank, bound = np.arange(3) < 1, Loops(bar)
+    poses = np.array([bound.closed(np.array([x, 0, 0]), crank) for x in (-0.2, 0.0, 0.2)])
+    assert bound.followers(poses, crank) == {}
 
 
 @pytest.mark.slow

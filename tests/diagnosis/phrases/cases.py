@@ -140,7 +140,6 @@ def warnings():
         *notes.below_noise(allowed),
         *notes.rows(0.0001, 0.002, 0.0005, fastest=True),
         *notes.rows(0.001, 0.002, 0.001, fastest=False),
-        *notes.one_motion(names, {1: 0}),
         *notes.conditions(1, one_log=True),
         *notes.conditions(3, one_log=False),
         *notes.finer_steps([("hinge.delay", 0.012, 0.002, "s", 0.0002), ("mass", 1.0, 0.1, "kg", 0.1)]),
