@@ -159,11 +159,7 @@ def prepare(
     led = inverse_dynamics_check.lead(candidates.enumerate_candidates(physics), checked.look)
     allowed = allows(cut.sigma_q)
     untried = [f"not tried: {text}" for text in left_out]
-    few = [
-        *notes.one_motion(cut.logs[0].channels.qvel, size.follows),
-        *notes.conditions(len(cut.groups), cut.blocks),
-        *notes.below_noise(allowed),
-    ]
+    few = [*notes.conditions(len(cut.groups), cut.blocks), *notes.below_noise(allowed)]
     units = notes.inertial(checked.bases, [stand.measure(log, robot.mj_model) for log in usable])
     warnings = [*checked.notes, *units, *timed.notes, *timed.warnings, *untried, *cut.notes]
     warnings += [*uncompared, *few]
