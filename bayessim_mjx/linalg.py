@@ -80,6 +80,12 @@ def inverse_lower(lower: Array) -> Array:
     return solve_lower(lower, jnp.broadcast_to(jnp.eye(lower.shape[-1], dtype=lower.dtype), lower.shape))
 
 
+def inverse(a: Array) -> Array:
+    """Inverse of positive definite matrices [d, d]."""
+    factor = inverse_lower(cholesky(a))
+    return product(factor.T, factor)
+
+
 def lower_factor(rows: Array) -> Array:
     """L [..., d, d], lower triangular with positive diagonal, with L L^T = R R^T for R = rows [..., d, m], m >= d.
 

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "bayessim_mjx"
 # walk: (functions, files, returns) at most
 WALKS = {
-    ("diagnosis.run:diagnose", ("diagnosis",)): (363, 51, 41),
+    ("diagnosis.run:diagnose", ("diagnosis",)): (362, 51, 41),
     ("loop.round_inference:infer", ("loop", "inference")): (108, 18, 14),
     ("loop.outer_loop:step", ("loop",)): (39, 7, 8),
 }

@@ -191,7 +191,8 @@ class Effect(abc.ABC):
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
         """Generalised force `[nv]` to add in this sub-step; `step.force` is the sum of all other known forces.
 
-        It includes the newest forces of the other effects (of this sub-step or the last), and no constraint forces.
+        It includes the newest forces of the other effects (of this sub-step or the last); of constraints only
+        equalities, see `SubStep`.
         """
         return memory, jnp.zeros_like(step.force)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayessim_mjx.compat import mjx
-from bayessim_mjx.effects.support.substep import SubStep
+from bayessim_mjx.effects.support.substep import SubStep, springs
 from bayessim_mjx.physics.controllers import Drive
 from bayessim_mjx.physics.gates import chained
 from bayessim_mjx.physics.model import IMPLICITFAST, Physics
@@ -44,6 +44,7 @@ def pushed(
     memory, last = carry
     outside = jnp.zeros_like(data.qfrc_applied) if drive.force is None else drive.force
     known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + outside
+    known = known + springs(data)[1] if data._impl.ne else known
     forcing = physics.having("on_force")
 
     def hook(step: SubStep, i: int, of_effect: tuple, total: jax.Array) -> tuple[tuple, jax.Array]:

@@ -14,7 +14,8 @@ import numpy as np
 
 from bayessim_mjx.compat import mjx
 from bayessim_mjx.effects.support.site import joint_dofs, ranges
-from bayessim_mjx.effects.support.substep import SubStep
+from bayessim_mjx.effects.support.substep import SubStep, springs
+from bayessim_mjx.linalg import inverse, product
 from bayessim_mjx.physics.controllers import Drive
 from bayessim_mjx.physics.gates import chained_in
 from bayessim_mjx.physics.model import EULER, IMPLICITFAST, RK4, Physics
@@ -117,7 +118,24 @@ def forward(own: Timestep, data: mjx.Data, carry: Memory) -> tuple[mjx.Data, Mem
 
 def _accelerated(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.fwd_acceleration(model, data)
+    if data._impl.ne and data._impl.ne == data._impl.nefc:
+        return _bound(model, data)
     return mjx.solve(model, data) if data._impl.efc_J.size else data.replace(qacc=data.qacc_smooth)
+
+
+def _bound(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Return the accelerations where equality constraints are all there is, which is linear: no solver has to iterate.
+
+    The second solution is of what rounding left of the first.
+    """
+    stiff, pull = springs(data)
+    matrix, wanted = mjx.full_m(model, data) + stiff, data.qfrc_smooth + pull
+    solution = inverse(matrix)
+    qacc = product(solution, wanted)
+    qacc = qacc + product(solution, wanted - product(matrix, qacc))
+    force = data._impl.efc_D * (data._impl.efc_aref - product(data._impl.efc_J, qacc))
+    exerted = product(data._impl.efc_J.T, force)
+    return data.tree_replace({"qacc": qacc, "qfrc_constraint": exerted, "_impl.efc_force": force})
 
 
 def _actuated(own: Timestep, data: mjx.Data, memory: tuple) -> tuple[mjx.Data, tuple, SubStep]:

@@ -130,3 +130,34 @@ def test_energy_only_leaves():
 def test_refusals():
     with pytest.raises(ValueError, match="no joint 'y'.*x"):
         run(XML.format(integrator="Euler", damping=0), ("y",), [0.0], [[0.0]], [0.0])
+
+
+PULLEY = """
+<mujoco>
+  <option timestep="0.002" gravity="0 0 -10" integrator="{integrator}"/>
+  <default><geom size=".1" contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body><joint name="table" type="slide" axis="1 0 0" damping="{damping}"/><geom mass="2"/></body>
+    <body><joint name="rope" type="slide" axis="0 0 -1"/><geom mass="1"/></body>
+  </worldbody>
+  <equality><joint joint1="table" joint2="rope" solref="0.004 1"/></equality>
+  <actuator><motor name="table" joint="table"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("integrator", "damping"), [("implicitfast", 4.0), pytest.param("RK4", 0.0, marks=pytest.mark.slow)]
+)
+def test_it_holds_what_hangs_on_another_joint_of_a_loop(integrator, damping):
+    """1 kg pulls 2 kg over a pulley by 10 N: 12 N of friction hold both, 4 N let both go with 6 N on 3 kg."""
+    xml = PULLEY.format(integrator=integrator, damping=damping)
+    away = {}
+    for level in (12.0, 4.0):
+        qpos, qvel = run(xml, ("table",), [level], np.zeros((60, 1)), np.zeros(2))
+        away[level] = qvel[-1]
+        np.testing.assert_allclose(*qpos[-1], atol=1e-4)
+    rate = damping / 3
+    gone = 2 * 0.6 if not rate else 2 * (1 - np.exp(-rate * 0.6)) / rate
+    np.testing.assert_allclose(away[12.0], 0.0, atol=1e-5)
+    np.testing.assert_allclose(away[4.0], gone, rtol=2e-3)

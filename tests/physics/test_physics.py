@@ -176,3 +176,36 @@ def test_a_start_in_a_log_remembers_the_commands_before_it():
     whole, again, forgetful = (float(x[0]) for x in moved())
     assert again == pytest.approx(whole, abs=1e-5)
     assert abs(forgetful - whole) > 0.05
+
+
+FOUR_BAR = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/>
+  <default><geom type="capsule" size="0.012" contype="0" conaffinity="0"/><joint axis="0 1 0" damping="0.02"/></default>
+  <worldbody>
+    <body><joint armature="0.01"/><geom fromto="0 0 0 0 0 0.15" mass="0.3"/>
+      <body name="coupler" pos="0 0 0.15"><joint name="coupler"/><geom fromto="0 0 0 0.3 0 0.05" mass="0.3"/></body>
+    </body>
+    <body name="rocker" pos="0.3 0 0"><joint name="rocker"/><geom fromto="0 0 0 0 0 0.2" mass="0.3"/></body>
+    <body pos="1 0 0"><joint name="wheel"/><geom fromto="0 0 0 0 0 0.1" mass="0.1"/></body>
+  </worldbody>
+  <tendon><fixed name="belt"><joint joint="wheel" coef="2"/><joint joint="rocker" coef="-1"/></fixed></tendon>
+  <equality>
+    <connect body1="coupler" body2="rocker" anchor="0.3 0 0.05" solref="0.004 1"/>
+    <tendon tendon1="belt" solimp="0.99 0.999 0.0001" solref="0.004 1"/>
+  </equality>
+  <actuator><motor joint="rocker"/></actuator></mujoco>
+"""
+
+
+def test_closed_loops_move_as_in_mujoco():
+    """Nothing but equality constraints: one linear solution in the place of the solver's iterations."""
+    model = mujoco.MjModel.from_xml_string(FOUR_BAR)
+    data, p = mujoco.MjData(model), Physics(model, 0.02, ParameterSpace())
+    step, world = jax.jit(lambda w, u: control_step(p, w, u)[0]), p.world(jnp.zeros(0))
+    for k in range(20):
+        data.ctrl[0] = 0.5 * np.sin(0.3 * k)
+        world = step(world, jnp.asarray(data.ctrl, jnp.float32))
+        mujoco.mj_step(model, data, p.substeps)
+    assert np.ptp(data.qpos) > 0.5
+    np.testing.assert_allclose(world.qpos, data.qpos, atol=1e-4)
+    np.testing.assert_allclose(world.qvel, data.qvel, atol=1e-3)

@@ -163,18 +163,22 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
         )
         if found or not kind.floats:
             without.setdefault(why, []).append(kind.name)
-    return tuple(made), [f"{', '.join(names)}: {why}" for why, names in without.items()]
+    names = [scales.model.joint(int(j)).name for j in scales.model.dof_jntid]
+    pairs = [(names[i], names[k]) for i, k in scales.follows.items()]
+    one = [f"forces at {i}: it moves with {k} at a fixed ratio, so {k} stands for both" for i, k in pairs]
+    return tuple(made), [*(f"{', '.join(names)}: {why}" for why, names in without.items()), *one]
 
 
 def _alive(kind: type[Effect], place: str, scales: Scales) -> bool:
-    """Joints that never moved, sensors that nothing reads, contacts that are off, controllers that nobody declared."""
+    """Joints that moved, not only with others; sensors that are read; contacts that are on; declared controllers."""
     model = scales.model
     if kind.loop:
         return bool(scales.loops[kind.loop][element_names(model, "actuator").index(place)])
     if kind.kind == "joint":
         joint = element_names(model, "joint").index(place)
         measures = kind.on_measurement is not Effect.on_measurement
-        return bool(scales.moves[(dof := model.jnt_dofadr[joint])] and (scales.read[dof] or not measures))
+        dof = int(model.jnt_dofadr[joint])
+        return bool(scales.moves[dof] and (scales.read[dof] if measures else dof not in scales.follows))
     if kind.kind == "geom":
         geom = element_names(model, "geom").index(place)
         off = int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)

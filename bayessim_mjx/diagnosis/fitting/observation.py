@@ -17,16 +17,15 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from bayessim_mjx.compat import mass_matrix
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
-from bayessim_mjx.diagnosis.fitting.scales import equality
 from bayessim_mjx.diagnosis.logcheck.drives import DeclaredLaw
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.odometry import base
 from bayessim_mjx.physics import controllers
+from bayessim_mjx.physics.loops import Loops
 
 Array = NDArray[np.float64]
 # rad or m, rad/s or m/s, of finite differences in doubles: the cube root of their precision balances the rounding of
@@ -86,7 +85,7 @@ def completed(logs: Sequence[Log], model: mujoco.MjModel) -> tuple[tuple[Log, ..
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """A smoothed motion: qpos `[T, nq]`, qvel `[T, nv]`, sd `[T, 2 nv]` and `known [2 nv]`, see `_gained`."""
+    """A motion: qpos `[T, nq]`, qvel `[T, nv]`, sd `[T, 2 nv]` and `known [2 nv]`, see `_gained`."""
 
     qpos: Array
     qvel: Array
@@ -111,7 +110,12 @@ def _with(log: Log, way: Way, model: mujoco.MjModel) -> Log:
 
 
 def _smoothed(log: Log, model: mujoco.MjModel) -> Way:
-    """Return the best of some sizes of what the model lacks."""
+    """Return the best of some sizes of what the model lacks; where constraints tell the motion, no model is needed."""
+    noise, prior = np.concatenate([log.sigma_dofs, log.sigma_qvel]), np.repeat(PRIOR, model.nv)
+    if (bound := Loops(model).followed(log.qpos, log.qvel, noise, log.seen_dofs)) is not None:
+        known = (prior / np.maximum(bound[2].max(0), NUDGE)) ** 2 - 1
+        if (known > 1).all():
+            return Way(*bound, known)
     stepper = Stepper(model, log)
     measured = _Measured.of(log)
     lacking = _accelerations(model, log)
@@ -160,7 +164,7 @@ class _Filter:
         seen = np.concatenate([log.seen_dofs, log.seen_dofs | log.seen_speeds])
         noise = np.maximum(np.concatenate([log.sigma_dofs, log.sigma_qvel]), NUDGE)
         self.prior = np.where(seen, np.minimum(3 * noise, np.repeat(PRIOR, nv)), np.repeat(PRIOR, nv))
-        self._run(stepper.closed(log.qpos[0], seen[:nv]), np.where(seen[nv:], log.qvel[0], 0.0))
+        self._run(stepper.loops.closed(log.qpos[0], seen[:nv]), np.where(seen[nv:], log.qvel[0], 0.0))
         qpos, qvel, _ = self._back()
         self._run(qpos[0], qvel[0])  # from the smoothed start: it is linearised there
 
@@ -280,7 +284,7 @@ class Stepper:
     def __init__(self, model: mujoco.MjModel, log: Log) -> None:
         self.model, self.log, self.nv = copy.copy(model), log, int(model.nv)
         self.data, self.longest = mujoco.MjData(self.model), float(model.opt.timestep)
-        self.checked = mujoco.MjData(self.model)  # for constraints: the stepped one keeps its actuators
+        self.loops = Loops(self.model)  # with data of its own: the stepped one keeps its actuators
         declared = controllers.declared(log.metadata)
         source = str(log.metadata.get("source", log.name))
         law = controllers.read(log.metadata, model, log.actuators, source) if declared else None
@@ -317,7 +321,7 @@ class Stepper:
         A constraint holds as exactly as the encoders' noise moves it.
         """
         nv = self.nv
-        J, off = equality(self.model, self.checked, qpos)
+        J, off = self.loops.at(qpos)
         if not len(J):
             return np.zeros((0, 2 * nv)), np.zeros(0), np.zeros(0)
         noise = np.zeros(2 * nv)
@@ -325,21 +329,6 @@ class Stepper:
         sd = np.maximum(np.concatenate([np.linalg.norm(J * n, axis=1) for n in (noise[:nv], noise[nv:])]), NUDGE)
         none = np.zeros_like(J)
         return np.block([[J, none], [none, J]]), np.concatenate([off, J @ qvel]), sd
-
-    def closed(self, qpos: Array, fixed: NDArray[np.bool_]) -> Array:
-        """Return a position with its equality constraints met by the joints that are not `fixed` `[nv]`."""
-        if not self.model.neq or fixed.all():
-            return np.array(qpos, float)
-
-        def at(change: Array) -> tuple[Array, Array, Array]:
-            there, whole = np.array(qpos, float), np.zeros(self.nv)
-            whole[~fixed] = change
-            mujoco.mj_integratePos(self.model, there, whole, 1.0)
-            return there, *equality(self.model, self.checked, there)
-
-        none = np.zeros(int((~fixed).sum()))
-        best = least_squares(lambda x: at(x)[2], none, jac=lambda x: at(x)[1][:, ~fixed]) if len(at(none)[2]) else None
-        return at(none if best is None else best.x)[0]
 
     def linearised(self, qpos: Array, qvel: Array, row: int, span: float | None = None) -> tuple[Array, Array, Array]:
         """`advanced`, and its derivatives by the state `[2 nv, 2 nv]`."""

@@ -39,7 +39,7 @@ WITHIN = (0.3, 2.0)
 RUBS = (0.2, 1.2)
 # Iterations of Newton's solver and of its line search. Measured: dry friction is solved to single precision by 4 and 6;
 # with six joints, half a second, the same to 1e-7 rad as by 100 and 50, at half the time. Equality constraints are
-# quadratic, which one step solves: a four-bar moves the same bit for bit, at half the time.
+# quadratic, which one step solves; where they are alone no step is needed (`physics.timestep`).
 ROUNDS = 8
 _IMPLICIT = int(mujoco.mjtIntegrator.mjINT_IMPLICIT)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
@@ -18,6 +18,7 @@ from bayessim_mjx.effects.support.site import element_names, floating
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import Parameter, geometry
+from bayessim_mjx.physics.loops import Loops
 
 Array = NDArray[np.float64]
 
@@ -39,7 +40,7 @@ class Scales:
 
     moves: `[nv]` bool, whether the joint moved by more than its noise at all; read: `[nv]` bool, whether anything reads
     the joint's encoder (a log, a servo or a declared controller); carried: `[nbody]`, kg that the robot can hold at
-    each body; period: s between the logs' rows; loops: see `drives.loops_of`.
+    each body; period: s between the logs' rows; loops: see `drives.loops_of`; follows: see `Loops.followers`.
     """
 
     model: mujoco.MjModel
@@ -54,6 +55,7 @@ class Scales:
     carried: Array
     period: float
     loops: Mapping[str, NDArray[np.bool_]]
+    follows: Mapping[int, int] = field(default_factory=dict)
 
     def at(self, kind: str, place: str) -> dict[str, float]:
         """{word of `Quantity.per`: scale} at one place."""
@@ -113,6 +115,7 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
             force[model.jnt_dofadr[joint]] = max(force[model.jnt_dofadr[joint]], direct * abs(gear))
     noise = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
     loops = drives.loops_of(model, logs)
+    read = read_by(model, logs, loops)
     return Scales(
         model=model,
         force=np.maximum(passed_on(force, speed, groups), 1e-9),
@@ -122,10 +125,11 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
         command=np.maximum(command, 1e-9),
         effort=effort,
         moves=ptp > 10 * noise + 1e-9,
-        read=read_by(model, logs, loops),
+        read=read,
         carried=drives.carried(model, places, rating),
         period=float(np.median([log.period for log in logs])),
         loops=loops,
+        follows=Loops(model).followers(places, read),
     )
 
 
@@ -160,10 +164,9 @@ def _along(model: mujoco.MjModel, logs: Sequence[Log]) -> tuple[Array, Array, Ar
 
 def bound(model: mujoco.MjModel, poses: Sequence[Array]) -> NDArray[np.int64]:
     """`[nv]`, a number of the group of joints that equality constraints bind to each other in these poses `[nq]`."""
-    together = np.eye(model.nv, dtype=bool)
-    data = mujoco.MjData(model)
+    together, loops = np.eye(model.nv, dtype=bool), Loops(model)
     for pose in poses if model.neq else ():
-        J = equality(model, data, pose)[0] != 0
+        J = loops.at(pose)[0] != 0
         together |= J.T @ J
     return np.asarray(connected_components(together)[1])
 
@@ -183,21 +186,6 @@ def read_by(model: mujoco.MjModel, logs: Sequence[Log], loops: Mapping[str, NDAr
         if (dof := drives.dof_of(model, int(i))) is not None:
             out[dof] = True
     return np.asarray(out)
-
-
-def equality(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array) -> tuple[Array, Array]:
-    """Return (derivatives `[m, nv]` of the active equality constraints by the position, their values `[m]`)."""
-    if not model.neq:
-        return np.zeros((0, model.nv)), np.zeros(0)
-    data.qpos[:] = qpos
-    mujoco.mj_fwdPosition(model, data)
-    own = np.flatnonzero(data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
-    J = np.zeros((data.nefc, model.nv))
-    if mujoco.mj_isSparse(model):
-        mujoco.mju_sparse2dense(J, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
-    else:
-        J = data.efc_J.reshape(data.nefc, model.nv)
-    return J[own].copy(), data.efc_pos[own].copy()
 
 
 def _moment(model: mujoco.MjModel) -> float:

@@ -22,7 +22,8 @@ def resist(at: Site, step: SubStep, level: jax.Array, damping: jax.Array) -> jax
 
     F = -(level + damping |w|) sgn(w), w at the *end* of the sub-step (implicit: stable for any damping). At rest F is
     whatever holds the joint, up to the level. Coupled joints: projected Gauss-Seidel from the forces of the last
-    sub-step. Constraint forces are not known yet: a joint that rests against a stop may creep within one sub-step.
+    sub-step. Forces of limits and contacts are not known yet: a joint that rests against a stop may creep within one
+    sub-step.
 
     Args:
         level: `[n, 2]` >= 0, dry friction against forward (w > 0) and against backward motion, N m (hinge) or N.

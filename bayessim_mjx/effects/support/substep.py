@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.support.site import ranges
-from bayessim_mjx.linalg import cholesky, inverse_lower, product
+from bayessim_mjx.linalg import inverse, product
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,7 +25,8 @@ class SubStep:
 
     Attributes:
         model, data: data holds this sub-step's poses, mass matrix, qfrc_bias, qfrc_passive, actuator_force and moments.
-        force: `[nv]`, passive - bias + actuators + all other effects; no constraint forces (they are not known yet).
+        force: `[nv]`, passive - bias + actuators + all other effects, and what equality constraints exert where nothing
+            accelerates; no other constraint forces (they are not known yet).
         actuator_force: `[nu]`, after the effects on actuators.
         ctrl: `[nu]`, the command as it reached the actuators.
         dt: s, the sub-step.
@@ -131,19 +132,25 @@ class SubStep:
 
     @property
     def inverse(self) -> jax.Array:
-        """`[nv, nv]`, inverse of the matrix that the integrator solves: M plus the implicit damping."""
+        """`[nv, nv]`, accelerations by forces, as integrated: inverse of M with implicit damping, in closed loops."""
 
         def compute() -> jax.Array:
-            factor = inverse_lower(cholesky(self._inertia()))
-            return product(factor.T, factor)
+            from mujoco import mjx
+
+            inertia = mjx.full_m(self.model, self.data)
+            free = self._damped(inertia)
+            if not self.data._impl.ne:
+                return inverse(free)
+            # the integrator adds damping once constraints are solved without it
+            within = inverse(inertia + springs(self.data)[0])
+            return within if free is inertia else product(inverse(free), product(inertia, within))
 
         return self._once("inverse", compute)
 
-    def _inertia(self) -> jax.Array:
+    def _damped(self, inertia: jax.Array) -> jax.Array:
         from mujoco import mjx
 
         model = self.model
-        inertia = mjx.full_m(model, self.data)
         integrator = int(model.opt.integrator)
         euler = integrator == int(mujoco.mjtIntegrator.mjINT_EULER)
         if euler and not int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP):
@@ -151,3 +158,13 @@ class SubStep:
         implicit = integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
         derivative = mjx.deriv_smooth_vel(self.solved, self.data) if implicit else None
         return inertia if derivative is None else inertia - model.opt.timestep * derivative
+
+
+def springs(data: "mjx.Data") -> tuple[jax.Array, jax.Array]:
+    """(J'DJ `[nv, nv]`, J'D a `[nv]`) of the equality constraints: their force on the joints is J'D (a - J qacc).
+
+    That is MuJoCo's soft constraint without an inequality: with them M becomes M + J'DJ, whatever else acts.
+    """
+    ne, own = data._impl.ne, data._impl  # they are the first rows
+    weighted = own.efc_J[:ne] * own.efc_D[:ne, None]
+    return product(weighted.T, own.efc_J[:ne]), product(weighted.T, own.efc_aref[:ne])

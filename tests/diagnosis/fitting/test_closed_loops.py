@@ -11,6 +11,7 @@ import pytest
 from bayessim_mjx.diagnosis.fitting import candidates, observation, robot, scales
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.physics import control_step
+from bayessim_mjx.physics.loops import Loops
 
 FOUR_BAR = """
 <mujoco><option timestep="0.001" integrator="implicitfast"/>
@@ -63,7 +64,9 @@ def rocker_of(crank):
     return np.arctan2(way[..., 0], way[..., 1]) + inner
 
 
-def test_the_loop_of_a_four_bar_tells_its_other_angles(tmp_path):
+def test_the_loop_of_a_four_bar_tells_its_other_angles(tmp_path, monkeypatch):
+    """By its geometry: no model of masses and friction has to be right for it."""
+    monkeypatch.setattr(observation, "Stepper", None)
     model, log = recorded(tmp_path, FOUR_BAR, "crank")
     crank, rocker = log.qpos[:, 0], log.qpos[:, 2]
     assert rocker_of(np.zeros(())) == pytest.approx(0, abs=1e-9)
@@ -109,6 +112,19 @@ def test_sensors_are_tried_where_something_reads_them(tmp_path):
     }
     servo = FOUR_BAR.replace("</actuator>", '<position name="fed" joint="rocker" kp="1"/></actuator>')
     assert list(scales.read_by(mujoco.MjModel.from_xml_string(servo), [], {})) == [False, False, True]
+
+
+def test_joints_that_move_as_one_are_one_place_for_forces(tmp_path):
+    """At 1.5 times the speed friction of a twin is that of the finger, larger: named where the encoder is."""
+    model, log = recorded(tmp_path, MIMIC, "left")
+    found = scales.measure(model, [log])
+    assert found.follows == {1: 0}
+    kinds = candidates.kinds_of(["coulomb_friction", "joint_offset"])
+    assert [e.places() for e in candidates.stack(kinds, found)[0]] == [("left",), ("left",)]
+    bar = mujoco.MjModel.from_xml_string(FOUR_BAR)
+    crank, bound = np.arange(3) < 1, Loops(bar)
+    poses = np.array([bound.closed(np.array([x, 0, 0]), crank) for x in (-0.2, 0.0, 0.2)])
+    assert bound.followers(poses, crank) == {}
 
 
 @pytest.mark.slow
