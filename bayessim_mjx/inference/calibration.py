@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 from scipy.special import ndtr
 
+from bayessim_mjx.compat import brief
 from bayessim_mjx.distributions import Distribution, box
 from bayessim_mjx.distributions.evaluate import candidates
 from bayessim_mjx.errors import UserError
@@ -40,7 +41,7 @@ class Ranks(NamedTuple):
     variance: Array  # [n, d] of the draws, in theta units
 
 
-@partial(jax.jit, static_argnames="draws")
+@partial(brief, static_argnames="draws")
 def ranks(
     key: Array, posteriors: Distribution, thetas: Array, draws: int = FEW, tilt: Distribution | None = None
 ) -> Ranks:

@@ -61,6 +61,7 @@ class LoopState:
     standing: Distribution | None = None  # the product used last, and what it gained on simulated sets (examination.py)
     standing_gain: Array | None = None  # [] nats
     standing_round: Array | None = None  # [] int32, the round that it comes from, from 1 on; 0: none was judged
+    settled: Array | None = None  # [] bool, see `bayessim.untilSettled`; None: all rounds are run
 
     @property
     def has_moved(self) -> bool:
@@ -90,6 +91,7 @@ class RoundInfo:
     refinement: Any = None  # what bayessim.refine made of the posterior, see likelihood_refinement.py
     set_posterior: Any = None  # how a network of sets did beside the product, see loop/set_posterior.py
     moves: tuple[Pile, ...] = ()  # ends of ranges at which the posterior piles up, and where they are in the next round
+    settled: str = ""  # why no further round is run; "": realIters alone
 
     def with_(self, found: Evidence) -> RoundInfo:
         """Add the evidence of the round's inference."""

@@ -30,8 +30,8 @@ def test_main_stops_only_after_the_rounds_checkpoint() -> None:
     stop.requested = True
     watched.round(None, None)
     with pytest.raises(KeyboardInterrupt):
-        watched.save(5, {"state": types.SimpleNamespace(round=1)}, meta={})
-    watched.save(10, {"state": types.SimpleNamespace(round=2)}, meta={})  # the last round: nothing is left to stop
+        watched.save(5, {"state": types.SimpleNamespace(round=1, settled=None)}, meta={})
+    watched.save(10, {"state": types.SimpleNamespace(round=2, settled=None)}, meta={})  # the last round: nothing is left to stop
     assert calls == ["round", (5, 7), (10, 7)]
 
 
