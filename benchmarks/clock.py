@@ -3,8 +3,8 @@
     python benchmarks/clock.py [ROW ...] [--commit HASH]     # writes records/clock.json: rows in place of its own
 
 Each row is a command in a fresh process: `cold` with an empty cache of its own, `second` once more with what it left
-there. A reference is the time that MuJoCo, in C, takes on one core for STEPS timesteps of a fixed body, in the same
-run: figures in references compare machines, and busy hours of one. CPU seconds are those of all threads.
+there. A reference is what `monitor.clock.reference` takes in the same run, MuJoCo in C on one core: figures in
+references compare machines, and busy hours of one. CPU seconds are those of all threads.
 
 Every moment counts as one thing alone: as tracing (with lowering) or compiling (or loading from the cache) while any
 thread does that, else as what the innermost of FUNCTIONS on the main thread is for, else as the rest.
@@ -29,15 +29,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from bayessim_mjx.monitor.clock import reference
+
 HERE = Path(__file__).parent
 RECORD = HERE / "records" / "clock.json"
-STEPS = 100_000
-BODY = """
-<mujoco><option timestep="0.002"/><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 1"><freejoint/>
-<geom type="capsule" fromto="0 0 0 0 .3 0" size=".05"/><body pos="0 .3 0"><joint axis="1 0 0" damping=".1"/>
-<geom type="capsule" fromto="0 0 0 0 .3 0" size=".04"/><body pos="0 .3 0"><joint axis="1 0 0" damping=".1"/>
-<geom type="capsule" fromto="0 0 0 0 .3 0" size=".03"/></body></body></body></worldbody></mujoco>
-"""
 PARTS = ("import", "trace", "compile", "simulate", "learn", "infer", "check", "draw", "write", "rest")
 STAGES = {  # events of jax, which begin and end on one thread
     "/jax/core/compile/jaxpr_trace_duration": "trace",
@@ -173,17 +168,6 @@ def watched(target: Path, begun: float, kind: str, command: list[str]) -> int:
     account.charge()
     target.write_text(json.dumps({"wall": account.wall, "cpu": account.cpu}), encoding="utf-8")
     return code
-
-
-def reference() -> tuple[float, float]:
-    """Wall and CPU seconds of STEPS timesteps of BODY."""
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_string(BODY)
-    data = mujoco.MjData(model)
-    wall, cpu = time.perf_counter(), time.process_time()
-    mujoco.mj_step(model, data, STEPS)
-    return time.perf_counter() - wall, time.process_time() - cpu
 
 
 def record_logs(folder: Path) -> None:
