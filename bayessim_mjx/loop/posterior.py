@@ -53,7 +53,8 @@ def _factors(loop: Loop, state: LoopState) -> tuple[Distribution, list[str]]:
             factors = jax.tree.map(lambda *leaves: jnp.stack(leaves), *quotients, *rows[done:])
             if (share := float(np.mean(lost))) > NEGLIGIBLE:
                 warnings.append(f"{percent(share)} of the posterior's weight cannot be divided by the proposal")
-    factors = jax.tree.map(lambda leaf: leaf[:count], kept(factors, state.fit.identified, b.priorShare))
+    factors = kept(factors, state.fit.identified, b.priorShare)
+    factors = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[:count]), factors)
     if loop.source.policy_dependent:  # type: ignore[union-attr]
         # an older trajectory was made by an older policy: its posterior stays that of the network of its time
         factors = select(jnp.arange(factors.logits.shape[0]) >= seen, factors, state.real_posteriors)
