@@ -114,7 +114,7 @@ def supply() -> None:
 
 
 @functools.cache
-def compiler_options(fused: bool = False) -> dict[str, Any]:
+def compiler_options(fused: bool = False, level: int | None = 1) -> dict[str, Any]:
     """Options for `jax.jit` on a CPU; none where the compiler does not know them.
 
     Args:
@@ -122,14 +122,16 @@ def compiler_options(fused: bool = False) -> dict[str, Any]:
             compile for twice as long. They may compute shared subexpressions anew in every consumer: for a chain of six
             joints MJX's kinematics then cost 150 times what they should (jaxlib 0.10).
 
+        level: of LLVM's optimisation; None: the last, for programs that run for minutes.
+
     LLVM's first level compiles in 4/5 of the time of its last, and 40 steps of 64 ants then take .10 CPU seconds in
     place of .17, ten updates of Pendulum's PPO 2.1 in place of 2.3.
     """
     if jax.default_backend() != "cpu":
         return {}
     options: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": fused}
-    if not jax.config.values["jax_disable_most_optimizations"]:  # else somebody has chosen the level
-        options["xla_backend_optimization_level"] = 1
+    if level is not None and not jax.config.values["jax_disable_most_optimizations"]:  # else somebody has chosen one
+        options["xla_backend_optimization_level"] = level
     try:
         jax.jit(lambda x: x + 1).lower(0.0).compile(options)  # unlike a call, also while jax traces another program
     except jax.errors.JaxRuntimeError:

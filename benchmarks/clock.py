@@ -18,6 +18,7 @@ import contextlib
 import functools
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -221,7 +222,10 @@ def main() -> int:
         record = json.loads(RECORD.read_text(encoding="utf-8"))
         known = {row[0]: row for row in record["table"]} | {row[0]: row for row in rows}
         record |= {"table": list(known.values()), "commit": args.commit}
-        RECORD.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
+        rows = re.compile(r"\[\n\s+([^\[\]{}]*?)\n\s+\]")
+        text = rows.sub(lambda found: "[" + re.sub(r"\n\s+", " ", found[1]) + "]", text)
+        RECORD.write_text(text, encoding="utf-8")
     return 0
 
 
