@@ -188,7 +188,7 @@ def test_under_logs_only_the_newest_evaluation_counts(monkeypatch, truth):
     monkeypatch.setattr(rl, "policy_of", lambda state: None)
     blank = dict.fromkeys((f.name for f in dataclasses.fields(loop.LoopState)), jnp.zeros(0))
     train = types.SimpleNamespace(iteration=jnp.int32(3), env_steps=jnp.uint32(24))
-    state = loop.LoopState(**{**blank, "round": jnp.int32(0), "train": train})
+    state = loop.LoopState(**{**blank, "round": jnp.int32(0), "train": train, "settled": None})
     ppo = types.SimpleNamespace(max_iterations=3, save_interval=1)
     parts = types.SimpleNamespace(
         settings=types.SimpleNamespace(realIters=2, ftuneRL=True), config=types.SimpleNamespace(ppo=ppo)
