@@ -129,7 +129,7 @@ def compiler_options(fused: bool = False, level: int | None = 1) -> dict[str, An
     """
     if jax.default_backend() != "cpu":
         return {}
-    options: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": fused}
+    options: dict[str, Any] = {"xla_cpu_use_fusion_emitters": fused}
     if level is not None and not jax.config.values["jax_disable_most_optimizations"]:  # else somebody has chosen one
         options["xla_backend_optimization_level"] = level
     try:

@@ -62,12 +62,10 @@ class Watched:
         meta: dict | None = None,
         supersede: bool = False,
     ) -> None:
-        from bayessim_mjx import loop
-
         self.session.flush()
         clock = {**(meta or {}), "seconds": self.session.wall.mark()}
         self.run.save(step, tree, evaluation=evaluation, meta=clock, supersede=supersede)
-        if not loop.finished(self.parts, tree["state"]):
+        if not self.parts.finished(tree["state"]):
             self.stop.check()
 
 
@@ -116,7 +114,7 @@ def _run(config: Config, run: Any, device: Any, command: Sequence[str], console:
         cli.say_changes(run, console)
     console.say(f"run folder {run.path}")
     with cli.running(run, console.say):
-        if loop.finished(parts, state):
+        if parts.finished(state):
             console.say("this run had finished; there is nothing to go on with")
         else:
             state = _rounds(parts, state, run, console, resumed_at)

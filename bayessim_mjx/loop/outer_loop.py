@@ -23,7 +23,6 @@ from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import InferenceSettings, rounds
-from bayessim_mjx.inference.numbers import NEGLIGIBLE
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import ranges
 from bayessim_mjx.loop.examination import reexamine
@@ -34,13 +33,12 @@ from bayessim_mjx.loop.trajectories import no_motion
 from bayessim_mjx.loop.watching import Monitor, Watching
 from bayessim_mjx.parameters.ranged import Ranged
 from bayessim_mjx.progress import shown
-from bayessim_mjx.quantities import percent
 from bayessim_mjx.rl import Policy, TrainState
 from bayessim_mjx.rl.recurrent import remembering
 
 __all__ = [
-    "PREDICTIVE_DRAWS", "Checkpoints", "Loop", "LoopState", "Monitor", "RoundInfo", "checkpoint_step", "finished",
-    "init", "make", "meta_of", "reexamine", "run", "score", "step", "train", "training_target", "tree_of",
+    "PREDICTIVE_DRAWS", "Checkpoints", "Loop", "LoopState", "Monitor", "RoundInfo", "checkpoint_step", "init", "make",
+    "meta_of", "reexamine", "run", "score", "step", "train", "training_target", "tree_of",
 ]  # fmt: skip
 
 
@@ -144,22 +142,6 @@ def _new_policy(
     return begin(loop.env, ppo, loop.key(round_, "init"), domain, mesh(loop.config), clock=clock)
 
 
-def finished(loop: Loop, state: LoopState) -> bool:
-    """Whether no further round is run."""
-    return int(state.round) >= loop.settings.realIters or bool(state.settled)
-
-
-def settled(before: Distribution, after: Distribution) -> str:
-    """Say that a posterior is the one before, which this round trained on; "" where it is not."""
-    change = after.estimates().apart(before.estimates())
-    if not change <= NEGLIGIBLE:
-        return ""
-    return (
-        f"settled: no median and no end of a 68 % interval has moved by more than {percent(change)} of the prior's "
-        "standard deviation; another round would train on the same physics (bayessim.untilSettled)"
-    )
-
-
 def training_target(loop: Loop, round_: int) -> int:
     """PPO iterations after which the training of `round_` is over (BayesSimIG: max_iterations *per round*)."""
     n = loop.config.ppo.max_iterations
@@ -201,10 +183,10 @@ def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
         state, found = infer(loop, state, policy)
         info = info.with_(found)
         if state.settled is not None and round_:
-            info.settled = settled(before, state.domain)
+            info.settled = loop.settled(before, state.domain)
             state = dataclasses.replace(state, settled=jnp.asarray(bool(info.settled)))
     state = dataclasses.replace(state, round=state.round + 1)
-    if not finished(loop, state):
+    if not loop.finished(state):
         # new episodes under the new domain also where the policy goes on
         new = _new_policy(loop, round_ + 1, state.domain)
         kept = rl.ppo.in_worlds_of(state.train, new) if loop.settings.ftuneRL else new
@@ -247,7 +229,7 @@ def _rounds(
     loop: Loop, state: LoopState, checkpoints: Checkpoints | None, monitor: Watching
 ) -> tuple[LoopState, list[RoundInfo]]:
     infos = []
-    while not finished(loop, state):
+    while not loop.finished(state):
         round_, last = int(state.round), [int(state.train.iteration)]
 
         def progress(

@@ -188,10 +188,12 @@ def test_under_logs_only_the_newest_evaluation_counts(monkeypatch, truth):
     monkeypatch.setattr(rl, "policy_of", lambda state: None)
     blank = dict.fromkeys((f.name for f in dataclasses.fields(loop.LoopState)), jnp.zeros(0))
     train = types.SimpleNamespace(iteration=jnp.int32(3), env_steps=jnp.uint32(24))
-    state = loop.LoopState(**{**blank, "round": jnp.int32(0), "train": train, "settled": None})
+    state = loop.LoopState(**{**blank, "round": jnp.int32(0), "train": train})
     ppo = types.SimpleNamespace(max_iterations=3, save_interval=1)
     parts = types.SimpleNamespace(
-        settings=types.SimpleNamespace(realIters=2, ftuneRL=True), config=types.SimpleNamespace(ppo=ppo)
+        settings=types.SimpleNamespace(realIters=2, ftuneRL=True),
+        config=types.SimpleNamespace(ppo=ppo),
+        finished=lambda state: int(state.round) == 2,
     )
     loop.run(parts, state, saves)
     assert [(t["supersede"], t["evaluation"]) for t in told] == [(truth is None, 2.0)] * 2
@@ -305,5 +307,5 @@ def test_a_run_ends_after_a_round_that_leaves_the_posterior_as_it_was(env, monke
 
     monkeypatch.setattr(outer_loop, "infer", infer)
     state, rounds = loop.run(parts, loop.init(parts))
-    assert int(state.round) == done and loop.finished(parts, state)
+    assert int(state.round) == done and parts.finished(state)
     assert [bool(info.settled) for info in rounds] == [False] * (done - 1) + [done < 4]
