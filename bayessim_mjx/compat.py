@@ -19,7 +19,7 @@ from bayessim_mjx import linalg
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on import that the optional warp is absent
     from mujoco import mjx
 
-__all__ = ["compiler_options", "mass_matrix", "mjx", "program", "put_replicated", "supply"]
+__all__ = ["brief", "compiler_options", "mass_matrix", "mjx", "program", "put_replicated", "supply"]
 
 CHAIN = 5  # bodies, one after the other, from which on a robot is a long chain
 DEEP = 8  # bodies likewise, from which on the options pay for trees with limbs too: they compile faster
@@ -114,15 +114,24 @@ def supply() -> None:
 
 
 @functools.cache
-def compiler_options() -> dict[str, Any]:
-    """Options for `jax.jit` of programs with kinematic chains; none where the compiler does not know them.
+def compiler_options(fused: bool = False, level: int | None = 1) -> dict[str, Any]:
+    """Options for `jax.jit` on a CPU; none where the compiler does not know them.
 
-    XLA's fusion on CPU may compute shared subexpressions anew in every consumer: for a chain of six joints MJX's
-    kinematics then cost 150 times what they should (jaxlib 0.10).
+    Args:
+        fused: whether XLA's emitters of fusions are used. They make loops of large arrays faster by up to a third and
+            compile for twice as long. They may compute shared subexpressions anew in every consumer: for a chain of six
+            joints MJX's kinematics then cost 150 times what they should (jaxlib 0.10).
+
+        level: of LLVM's optimisation; None: the last, for programs that run for minutes.
+
+    LLVM's first level compiles in 4/5 of the time of its last, and 40 steps of 64 ants then take .10 CPU seconds in
+    place of .17, ten updates of Pendulum's PPO 2.1 in place of 2.3.
     """
-    options: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
     if jax.default_backend() != "cpu":
         return {}
+    options: dict[str, Any] = {"xla_cpu_use_fusion_emitters": fused}
+    if level is not None and not jax.config.values["jax_disable_most_optimizations"]:  # else somebody has chosen one
+        options["xla_backend_optimization_level"] = level
     try:
         jax.jit(lambda x: x + 1).lower(0.0).compile(options)  # unlike a call, also while jax traces another program
     except jax.errors.JaxRuntimeError:
@@ -130,25 +139,42 @@ def compiler_options() -> dict[str, Any]:
     return options
 
 
-def program(function: Callable[..., Any], env: Any, **settings: Any) -> Any:
-    """`jax.jit(function, **settings)`, with `compiler_options` where the environment's robot is a serial chain.
+def program(function: Callable[..., Any], env: Any = None, **settings: Any) -> Any:
+    """`jax.jit(function, **settings)` of a program that runs for long, with `compiler_options`.
 
-    Bodies as deep in their trees as others are computed together, so that trees with several limbs are not slowed down,
-    and their programs stay as they are; those of a deep one, as a hand on its arm, compile in about two thirds of the
-    time with the options. Inside another program its options hold: jax takes none there.
+    Bodies as deep in their trees as others are computed together, so that XLA's fusions do not slow down trees with
+    several limbs; where the environment's robot is a serial chain, or as deep as a hand on its arm, there are none.
+    """
+    fused = not _serial(getattr(env, "mj_model", None))
+    return _with(lambda: compiler_options(fused), function, settings)
+
+
+def brief(function: Callable[..., Any], **settings: Any) -> Any:
+    """`jax.jit(function, **settings)` of a program that runs for less time than it takes to compile.
+
+    Loops over many small numbers (weighing mixtures) take six times as long.
+    """
+    return _with(compiler_options, function, settings)
+
+
+def _with(options: Callable[[], dict[str, Any]], function: Callable[..., Any], settings: dict[str, Any]) -> Any:
+    """`jax.jit` with compiler options, which are asked for at the first call.
+
+    Inside another program its options hold: jax takes none there.
     """
     inner = jax.jit(function, **settings)
-    options = compiler_options() if _serial(getattr(env, "mj_model", None)) else {}
-    if not options:
-        return inner
-    outer = jax.jit(function, compiler_options=options, **settings)
+
+    @functools.cache
+    def outer() -> Any:
+        return jax.jit(function, compiler_options=options(), **settings)
 
     @functools.wraps(function)
     def call(*args: Any, **named: Any) -> Any:
         inside = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, named)))
-        return (inner if inside else outer)(*args, **named)
+        return (inner if inside else outer())(*args, **named)
 
-    call.lower = outer.lower  # type: ignore[attr-defined]
+    call.lower = lambda *args, **named: outer().lower(*args, **named)  # type: ignore[attr-defined]
+    call._cache_size = lambda: outer()._cache_size()  # type: ignore[attr-defined]
     return call
 
 

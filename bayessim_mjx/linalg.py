@@ -25,6 +25,14 @@ def product(a: Array, b: Array) -> Array:
 def solve_lower(lower: Array, right: Array) -> Array:
     """Z with lower Z = right, by forward substitution: lower [..., d, d], right [..., d, m] -> [..., d, m]."""
 
+    d = lower.shape[-1]
+    if 0 < d <= UNROLLED:
+        rows: list[Array] = []
+        for i in range(d):
+            before = _dot([lower[..., i, j, None] for j in range(i)], rows)
+            rows.append((right[..., i, :] - before) / lower[..., i, i, None])
+        return jnp.stack(rows, axis=-2)
+
     def row(i: Array, z: Array) -> Array:
         left = jax.lax.dynamic_index_in_dim(lower, i, -2, keepdims=True)  # [..., 1, d]
         pivot = jax.lax.dynamic_index_in_dim(left, i, -1, keepdims=True)
@@ -32,7 +40,7 @@ def solve_lower(lower: Array, right: Array) -> Array:
         new = (jax.lax.dynamic_index_in_dim(right, i, -2, keepdims=True) - product(left, z)) / pivot
         return jax.lax.dynamic_update_slice_in_dim(z, new, i, -2)
 
-    return jax.lax.fori_loop(0, lower.shape[-1], row, jnp.zeros_like(right))
+    return jax.lax.fori_loop(0, d, row, jnp.zeros_like(right))
 
 
 def cholesky(a: Array) -> Array:

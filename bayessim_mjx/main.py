@@ -65,7 +65,7 @@ class Watched:
         self.session.flush()
         clock = {**(meta or {}), "seconds": self.session.wall.mark()}
         self.run.save(step, tree, evaluation=evaluation, meta=clock, supersede=supersede)
-        if int(tree["state"].round) < self.parts.settings.realIters:  # else all is done
+        if not self.parts.finished(tree["state"]):
             self.stop.check()
 
 
@@ -114,7 +114,7 @@ def _run(config: Config, run: Any, device: Any, command: Sequence[str], console:
         cli.say_changes(run, console)
     console.say(f"run folder {run.path}")
     with cli.running(run, console.say):
-        if int(state.round) >= config.bayessim.realIters:
+        if parts.finished(state):
             console.say("this run had finished; there is nothing to go on with")
         else:
             state = _rounds(parts, state, run, console, resumed_at)

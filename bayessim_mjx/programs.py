@@ -63,7 +63,7 @@ class Kept:
         def flat(*leaves: Any) -> Any:
             return self.function(*jax.tree.unflatten(tree, leaves))
 
-        return jax.jit(flat, compiler_options=compiler_options())
+        return jax.jit(flat, compiler_options=compiler_options(level=None))
 
     def _from_disk(self, name: str, leaves: list[Any], tree: Any) -> Any:
         folder = loading.cache_folder()
@@ -79,7 +79,7 @@ class Kept:
                 _write(path, bytes(exported.serialize()))
             except (ValueError, NotImplementedError, OSError):  # a custom call that JAX does not promise to keep
                 return own
-        return jax.jit(exported.call, compiler_options=compiler_options())
+        return jax.jit(exported.call, compiler_options=compiler_options(level=None))
 
 
 def traced_from(physics: Physics, *more: Any) -> str | None:

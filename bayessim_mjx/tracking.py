@@ -21,7 +21,7 @@ from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
-from bayessim_mjx.compat import program
+from bayessim_mjx.compat import brief, program
 from bayessim_mjx.effects.support.motion import Motion
 from bayessim_mjx.kalman import Gains, push
 from bayessim_mjx.physics import Drive, Physics, control_step
@@ -140,7 +140,7 @@ def _transitions(physics: Physics) -> Callable[..., Any]:
         rows = record.command, record.qpos[1:], record.qvel[1:], gains.gain
         return jax.lax.scan(step, (world, jnp.zeros(nv)), rows)[1]
 
-    return program(jax.vmap(one, in_axes=(None, 0, 0, None)), physics)
+    return brief(jax.vmap(one, in_axes=(None, 0, 0, None)))
 
 
 def transitions(

@@ -285,3 +285,10 @@ def test_a_missing_file_an_absent_anchor_and_an_unknown_flag_are_noticed(tmp_pat
         ("train", "--tasks Ant"),
     ]
     assert "--tasks" not in flags_of("train") and "--task" in flags_of("train")
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/first_run.md"])
+def test_pages_promise_of_the_first_command_what_the_clock_measured(page):
+    table = json.loads((ROOT / "benchmarks" / "records" / "clock.json").read_text())["table"]
+    seconds = next(float(row[1]) for row in table if row[0] == "main Pendulum, cold, cpu")
+    assert f"{seconds / 60:.0f} CPU minutes" in (ROOT / page).read_text()

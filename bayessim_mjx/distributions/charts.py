@@ -6,6 +6,7 @@ logit: z = log(u / (1 - u)); the prior is logistic, nothing is cut off.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -13,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.scipy.special import ndtr, ndtri
+
+from bayessim_mjx.compat import brief
 
 CHARTS = ("plain", "probit", "logit")
 EDGE = 1e-6  # unit coordinates are kept this far from 0 and 1 where a chart is infinite there
@@ -33,8 +36,11 @@ def check(chart: str) -> str:
 
 def to_chart(u: Array, chart: str) -> Array:
     """Map unit coordinates to z, elementwise."""
-    if chart == "plain":
-        return u
+    return u if chart == "plain" else _to_chart(u, chart)
+
+
+@partial(brief, static_argnums=1)
+def _to_chart(u: Array, chart: str) -> Array:
     u = jnp.clip(u, EDGE, 1 - EDGE)
     return ndtri(u) if chart == "probit" else jnp.log(u) - jnp.log1p(-u)
 

@@ -43,6 +43,12 @@ class Estimates:
         """[d]: 1 - posterior variance / prior variance."""
         return 1.0 - self.width**2
 
+    def apart(self, other: Estimates) -> float:
+        """Find the largest distance of medians, of ends of intervals, in the prior's sd, and of the prior's shares."""
+        unit = self.sd / self.width
+        ends = [np.abs(getattr(self, end) - getattr(other, end)) / unit for end in ("low", "median", "high")]
+        return float(max(np.max(ends, initial=0.0), abs(self.prior_share - other.prior_share)))
+
     def sentence(self) -> str:
         """State in words how much of the prior is kept; "" where nothing is."""
         if self.prior_share >= PRIOR_ITSELF:

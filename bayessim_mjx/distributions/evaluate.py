@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 from jax.scipy.special import ndtri
 
+from bayessim_mjx.compat import brief
 from bayessim_mjx.distributions import box, charts
 from bayessim_mjx.distributions.charts import Parts
 from bayessim_mjx.linalg import lower_factor, product, solve_lower
@@ -38,7 +39,7 @@ def to_theta(space: Any, u: Array) -> Array:
     return jnp.clip(rowwise(space.from_unit, u), low[None, :], high[None, :])
 
 
-@partial(jax.jit, static_argnames="points")
+@partial(brief, static_argnames="points")
 def log_inside(logits: Array, means: Array, scales: Array, points: int = box.MASS_POINTS) -> Array:
     return jax.nn.logsumexp(jax.nn.log_softmax(logits) + box.log_masses(means, scales, points))
 
@@ -58,14 +59,23 @@ def placed(q: Parts, rows: Array) -> tuple[Array, Array]:
     return inside, jnp.clip(rowwise(q.space.to_unit, safe), 0, 1)
 
 
-@jax.jit
+@brief
 def log_gain(q: Parts, theta: Array) -> Array:
     inside, u = placed(q, as_rows(theta))
     return jnp.where(inside, log_unit(q, u), -jnp.inf).reshape(theta.shape[:-1])
 
 
-@partial(jax.jit, static_argnames="n")
 def sample(q: Parts, key: Array, n: int) -> Array:
+    """Draw theta [n, d]; of what is called by itself more are drawn, so that hardly any n needs another program.
+
+    The first of more draws are those of fewer (`jax_threefry_partitionable`).
+    """
+    inside = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((q, key)))
+    return _sample(q, key, n) if inside else _sample(q, key, max(POINTS, 1 << (n - 1).bit_length()))[:n]
+
+
+@partial(brief, static_argnames="n")
+def _sample(q: Parts, key: Array, n: int) -> Array:
     key_flat, key_u, key_mog = jax.random.split(key, 3)
     flat = jax.random.uniform(key_flat, (n,)) < q.prior_weight
     u = jax.random.uniform(key_u, (n, q.means.shape[-1]))
@@ -96,7 +106,7 @@ def candidates(q: Parts, key: Array, n: int) -> tuple[Array, Array]:
     return jnp.where(flat[:, None], w[:, 2:], u), jnp.where(flat, thinned, drawn)
 
 
-@partial(jax.jit, static_argnames="points")
+@partial(brief, static_argnames="points")
 def component_points(q: Parts, points: int) -> tuple[Array, Array]:
     """Place points [K, n, d] of each component inside the cube, with log weights [K, n] whose mean is its mass."""
     w = jnp.asarray(box.lattice(points, q.means.shape[-1]))
@@ -111,7 +121,7 @@ def prior_points(space: Any) -> Array:
     return rowwise(space.from_unit, jnp.asarray(box.lattice(POINTS, len(space))))
 
 
-@partial(jax.jit, static_argnames="points")
+@partial(brief, static_argnames="points")
 def quadrature(q: Parts, points: int) -> tuple[Array, Array]:
     u, log_weight = component_points(q, points)
     mass = jax.nn.softmax((jax.nn.log_softmax(q.logits)[:, None] + log_weight).reshape(-1))
@@ -120,7 +130,7 @@ def quadrature(q: Parts, points: int) -> tuple[Array, Array]:
     return to_theta(q.space, jnp.concatenate([flat, as_rows(u)])), weights
 
 
-@jax.jit
+@brief
 def moments(q: Parts) -> tuple[Array, Array]:
     theta, weights = quadrature(q, POINTS)
     mean = weights @ theta
@@ -133,7 +143,7 @@ def centres_unit(q: Parts) -> Array:
     return jnp.clip(charts.from_chart(q.means, q.chart), 0, 1)
 
 
-@jax.jit
+@brief
 def mode(q: Parts) -> Array:
     theta, _ = quadrature(q, POINTS)
     centres = to_theta(q.space, centres_unit(q))
@@ -151,7 +161,7 @@ def _ranked(q: Parts, rows: Array) -> Array:
     return jnp.where(inside, log_unit(q, u) - LEVEL_OUT * jnp.mean(u, axis=-1), -jnp.inf)
 
 
-@jax.jit
+@brief
 def credible_level(q: Parts, theta: Array) -> Array:
     points, weights = quadrature(q, POINTS)
     here, there = _ranked(q, as_rows(theta)), _ranked(q, points)
@@ -159,7 +169,7 @@ def credible_level(q: Parts, theta: Array) -> Array:
     return level.reshape(theta.shape[:-1])
 
 
-@partial(jax.jit, static_argnums=1)
+@partial(brief, static_argnums=1)
 def marginal(q: Parts, index: tuple[int, ...]) -> tuple[Array, Array, Array]:
     """logits, means and scales of the coordinates `index`; each component keeps its mass inside the cube."""
     ids = np.asarray(index)
@@ -171,7 +181,7 @@ def marginal(q: Parts, index: tuple[int, ...]) -> tuple[Array, Array, Array]:
     return logits, means, scales
 
 
-@partial(jax.jit, static_argnums=(1, 2))
+@partial(brief, static_argnums=(1, 2))
 def conditional(q: Parts, given: tuple[int, ...], free: tuple[int, ...], u: Array) -> tuple[Array, Array, Array, Array]:
     """logits, means, scales and prior weight of the coordinates `free` where those `given` are u [g]. Exact."""
     # the factor of the coordinates in this order: its blocks are those of the marginal and of the conditional

@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 from scipy.special import ndtr
 
+from bayessim_mjx.compat import brief
 from bayessim_mjx.distributions import Distribution, box
 from bayessim_mjx.distributions.evaluate import candidates
 from bayessim_mjx.errors import UserError
@@ -40,7 +41,7 @@ class Ranks(NamedTuple):
     variance: Array  # [n, d] of the draws, in theta units
 
 
-@partial(jax.jit, static_argnames="draws")
+@partial(brief, static_argnames="draws")
 def ranks(
     key: Array, posteriors: Distribution, thetas: Array, draws: int = FEW, tilt: Distribution | None = None
 ) -> Ranks:
@@ -99,10 +100,16 @@ class Report:
     before: str | None = None  # the verdict without it
     widths: tuple[int, ...] = ()  # parameters on whose widths alone an over- or under-confident verdict rests
     predictive: float | None = None  # p-value of the posterior predictive check
+    fitted: int = 0  # pairs besides, on which the temperature was fitted
 
     @property
     def pairs(self) -> int:
         return len(self.ranks.level)
+
+    @property
+    def densities(self) -> int:
+        """Pairs whose posterior is a density, whatever they were used for."""
+        return self.pairs + self.fitted
 
     def evidence(self) -> str:
         """Return the coverage that the verdict rests on: `HPD coverage 50 %: 49 ± 2 %, 80 %: ...`.
@@ -243,7 +250,8 @@ def corrected(key: Array, posteriors: Distribution, thetas: Array, tilt: Distrib
     found = jax.tree.map(np.asarray, ranks(branch(key, 1), wider, jnp.asarray(thetas), tilt=tilt))
     after = judge(_usable(Ranks(*(part[n // 2 :] for part in found))), posteriors.space.unbatched)
     words = f"{report.words}; standard deviations times {factor:.2f}, then {after.words}"
-    return replace(after, words=words, temperature=factor, before=report.verdict)
+    fitted = report.pairs - after.pairs
+    return replace(after, words=words, temperature=factor, before=report.verdict, fitted=fitted)
 
 
 def _temperature_by_level(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any
 
 import jax
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from bayessim_mjx.compat import brief, program
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference import ensemble, identify, mdn, whitening
@@ -27,19 +28,7 @@ from bayessim_mjx.inference.train import MEMBERS, train
 FEW = 3000
 
 
-@lru_cache
-def _program(function: Any, static: tuple[int, ...] = ()) -> Any:
-    """Compile the function at LLVM's first level on the CPU: a tenth less to compile, and no slower."""
-    level = {"xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else None
-    return jax.jit(function, static_argnums=static, compiler_options=level)
-
-
-def _run(function: Any, *given: Any, static: tuple[int, ...] = ()) -> Any:
-    """Run a whole program, or a part of one that is being traced, which has no options of its own."""
-    inside = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(given))
-    return function(*given) if inside else _program(function, static)(*given)
-
-
+@partial(brief, static_argnums=(1, 2, 3))
 def _blank(key: Array, settings: InferenceSettings, dim_x: int, d: int) -> dict[str, Any]:
     """Weights of the whole ensemble `[E, ...]`, and what a FitState has besides them: one program."""
     counts = jnp.asarray(mdn.counts(settings))
@@ -59,7 +48,7 @@ def init(key: Array, settings: InferenceSettings, space: Any, dim_x: int) -> Fit
     if dim_x < 1:
         raise UserError(f"dim_x = {dim_x}: a summary needs at least one feature")
     settings = settings.at(space)
-    blank = _run(_blank, key, settings, dim_x, len(space), static=(1, 2, 3))
+    blank = _blank(key, settings, dim_x, len(space))
     return FitState(**blank, settings=settings, space=space)
 
 
@@ -104,7 +93,7 @@ def fit(
         _check_proposals(state, thetas, proposals, origin)
         origin = jnp.asarray(origin, jnp.int32)
     thetas, x = jnp.asarray(thetas, jnp.float32), jnp.asarray(x, jnp.float32)
-    state, info = _run(_fit, key, state, thetas, x, jnp.asarray(count, np.int32), proposals, origin, again)
+    state, info = _fit(key, state, thetas, x, jnp.asarray(count, np.int32), proposals, origin, again)
     if not isinstance(info.n_train, jax.core.Tracer) and int(info.n_train) == 0:
         raise UserError(f"none of the {int(count)} rows is usable: summaries not finite, or thetas outside the box")
     return state, info
@@ -132,6 +121,7 @@ def _condition(state: FitState, x: Array) -> Distribution:
     return ensemble.posteriors(state, state.inputs(x))
 
 
+@program
 def _fit(
     key: Array,
     state: FitState,

@@ -46,15 +46,19 @@ def identified(gain: Array, mask: Array) -> tuple[Array, Array]:
 def restore_prior(posterior: Distribution, keep: Array) -> Distribution:
     """Keep the posterior over the parameters to keep [d] and the prior over the others, independent of them."""
     q, keep = posterior, jnp.asarray(keep)
-    means, scales = q.means, q.scales
-    if q.chart == "plain":  # the others are cut off at their ranges, which moves what is correlated with them
-        cut = jax.vmap(_beside_cut, in_axes=(0, 0, None))(means, scales, keep)
-        means, scales = (jnp.where(jnp.all(keep), *pair) for pair in zip((means, scales), cut, strict=True))
-    means, scales = beside_prior(means, scales, keep, q.chart)
-    logits = jax.nn.log_softmax(q.logits)
-    if q.chart == "plain":  # each component keeps its mass inside the cube
-        logits = logits + box.log_masses(q.means, q.scales) - box.log_masses(means, scales)
-    return Distribution.from_unit(q.space, logits, means, scales, q.prior_weight, q.chart)
+
+    def restored() -> Distribution:
+        means, scales = q.means, q.scales
+        if q.chart == "plain":  # the others are cut off at their ranges, which moves what is correlated with them
+            means, scales = jax.vmap(_beside_cut, in_axes=(0, 0, None))(means, scales, keep)
+        means, scales = beside_prior(means, scales, keep, q.chart)
+        logits = jax.nn.log_softmax(q.logits)
+        if q.chart == "plain":  # each component keeps its mass inside the cube
+            logits = logits + box.log_masses(q.means, q.scales) - box.log_masses(means, scales)
+        return Distribution.from_unit(q.space, logits, means, scales, q.prior_weight, q.chart)
+
+    # mostly all are kept, and the masses behind the others are what conditioning takes longest for
+    return jax.lax.cond(jnp.all(keep), lambda: q, restored)
 
 
 def beside_prior(means: Array, scales: Array, keep: Array, chart: str) -> tuple[Array, Array]:

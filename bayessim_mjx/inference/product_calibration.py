@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bayessim_mjx.compat import program
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.inference.fit import combine
 from bayessim_mjx.inference.numbers import DOUBT, ROUNDED, SURE
@@ -225,7 +226,7 @@ def _gains(q: Distribution, thetas: jax.Array) -> jax.Array:
     return jax.lax.map(at, jnp.asarray(FACTORS, jnp.float32))
 
 
-@jax.jit
+@program
 def _levels(q: Distribution, thetas: jax.Array, factors: jax.Array) -> jax.Array:
     return jax.vmap(lambda q, t, f: tempered(q, f).credible_level(t))(q, thetas, factors)
 

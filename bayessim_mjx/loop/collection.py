@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from bayessim_mjx.compat import brief
 from bayessim_mjx.inference import summaries
 from bayessim_mjx.inference.numbers import DEFENSIVE
 from bayessim_mjx.inference.summarizers import feature_names
@@ -61,6 +62,7 @@ def _ones(actions: int, memory: int) -> Callable[[Array, dict], Array]:
     return lambda key, obs: jnp.pad(jnp.ones(actions), (0, memory))
 
 
+@functools.partial(brief, static_argnums=0)
 def summarise(summarizer: Callable, trajectory: Trajectory) -> Array:
     """Features [worlds, D] of trajectories, from observations and actions while the episodes ran."""
     return jax.vmap(summarizer)(trajectory.observation, trajectory.action, trajectory.valid)

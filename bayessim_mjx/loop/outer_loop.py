@@ -116,6 +116,7 @@ def blank(loop: Loop) -> dict[str, Any]:
         "standing": domain if infers else None,
         "standing_gain": jnp.float32(-jnp.inf) if infers else None,
         "standing_round": jnp.int32(0) if infers else None,
+        "settled": jnp.asarray(False) if infers and b.untilSettled else None,
     }
 
 
@@ -178,10 +179,14 @@ def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
         warnings=[],
     )
     if loop.settings.modelClass is not None:
+        before = state.domain
         state, found = infer(loop, state, policy)
         info = info.with_(found)
+        if state.settled is not None and round_:
+            info.settled = loop.settled(before, state.domain)
+            state = dataclasses.replace(state, settled=jnp.asarray(bool(info.settled)))
     state = dataclasses.replace(state, round=state.round + 1)
-    if round_ + 1 < loop.settings.realIters:
+    if not loop.finished(state):
         # new episodes under the new domain also where the policy goes on
         new = _new_policy(loop, round_ + 1, state.domain)
         kept = rl.ppo.in_worlds_of(state.train, new) if loop.settings.ftuneRL else new
@@ -224,7 +229,7 @@ def _rounds(
     loop: Loop, state: LoopState, checkpoints: Checkpoints | None, monitor: Watching
 ) -> tuple[LoopState, list[RoundInfo]]:
     infos = []
-    while int(state.round) < loop.settings.realIters:
+    while not loop.finished(state):
         round_, last = int(state.round), [int(state.train.iteration)]
 
         def progress(

@@ -15,7 +15,7 @@ from bayessim_mjx import inference
 from bayessim_mjx.config import Config
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.env import Env
-from bayessim_mjx.inference.numbers import NEGLIGIBLE
+from bayessim_mjx.inference.numbers import FEW, NEGLIGIBLE
 from bayessim_mjx.inference.rounds import REGION
 from bayessim_mjx.inference.temperature import widened
 from bayessim_mjx.loop.state import Answer, Evidence, Loop, LoopState, chart_of, space_of
@@ -39,7 +39,11 @@ def condition(loop: Loop, state: LoopState) -> tuple[LoopState, Answer, Evidence
 def _factors(loop: Loop, state: LoopState) -> tuple[Distribution, list[str]]:
     """Condition on every real trajectory: q(theta | x), leaves [real trajectories, ...], and warnings."""
     b, seen, warnings = loop.settings, int(state.round) * loop.settings.realTrajs, []
-    factors = conditioned(state.fit, state.real_features, state.temperature)
+    count = len(state.real_features)
+    # as many rows as the sets that judge the product: one program for both
+    padded = np.zeros((max(FEW, count), loop.feature_size), np.float32)
+    padded[:count] = state.real_features
+    factors = conditioned(state.fit, padded, state.temperature)
     if b.proposal == "division":
         assert state.proposals is not None
         rows = jax.tree.map(np.asarray, factors).split()
@@ -50,6 +54,7 @@ def _factors(loop: Loop, state: LoopState) -> tuple[Distribution, list[str]]:
             if (share := float(np.mean(lost))) > NEGLIGIBLE:
                 warnings.append(f"{percent(share)} of the posterior's weight cannot be divided by the proposal")
     factors = kept(factors, state.fit.identified, b.priorShare)
+    factors = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[:count]), factors)
     if loop.source.policy_dependent:  # type: ignore[union-attr]
         # an older trajectory was made by an older policy: its posterior stays that of the network of its time
         factors = select(jnp.arange(factors.logits.shape[0]) >= seen, factors, state.real_posteriors)

@@ -99,7 +99,7 @@ def lost(report: Report | None, x: Array) -> bool:
     otherwise than those before.
     """
     usable = int(np.isfinite(np.asarray(x)).all(1).sum())
-    return (0 if report is None else report.pairs) < SOUND * usable
+    return (0 if report is None else report.densities) < SOUND * usable
 
 
 def train(

@@ -6,6 +6,7 @@ Both are turned into summaries by the same function as the simulated trajectorie
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from bayessim_mjx.compat import brief
 from bayessim_mjx.config import Config
 from bayessim_mjx.config.settings import number as finite
 from bayessim_mjx.env import Env
@@ -89,6 +91,7 @@ class Surrogate:
         """theta [count, d] of the surrogate, inside the box, or between `ends`."""
         return self._drawn(key, count)[1]
 
+    @partial(brief, static_argnums=(0, 2))
     def _drawn(self, key: Array, count: int) -> tuple[Array, Array]:
         """Components [count] and their theta [count, d]."""
         k_component, k_noise = jax.random.split(key)

@@ -16,6 +16,7 @@ from bayessim_mjx.env import Env
 from bayessim_mjx.inference import InferenceSettings, checks, rounds
 from bayessim_mjx.inference.calibration import Report
 from bayessim_mjx.inference.misspecification import Misfit
+from bayessim_mjx.inference.numbers import NEGLIGIBLE
 from bayessim_mjx.inference.product_calibration import Sets
 from bayessim_mjx.inference.range_ends import Pile
 from bayessim_mjx.keys import branch
@@ -23,6 +24,7 @@ from bayessim_mjx.loop.sources import Source
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.parameters.ranged import Ranged
 from bayessim_mjx.physics.visuals import collides
+from bayessim_mjx.quantities import percent
 from bayessim_mjx.rl import Policy, TrainState
 from bayessim_mjx.rollout import Trajectory
 
@@ -61,6 +63,7 @@ class LoopState:
     standing: Distribution | None = None  # the product used last, and what it gained on simulated sets (examination.py)
     standing_gain: Array | None = None  # [] nats
     standing_round: Array | None = None  # [] int32, the round that it comes from, from 1 on; 0: none was judged
+    settled: Array | None = None  # [] bool, see `bayessim.untilSettled`; None: all rounds are run
 
     @property
     def has_moved(self) -> bool:
@@ -90,6 +93,7 @@ class RoundInfo:
     refinement: Any = None  # what bayessim.refine made of the posterior, see likelihood_refinement.py
     set_posterior: Any = None  # how a network of sets did beside the product, see loop/set_posterior.py
     moves: tuple[Pile, ...] = ()  # ends of ranges at which the posterior piles up, and where they are in the next round
+    settled: str = ""  # why no further round is run; "": realIters alone
 
     def with_(self, found: Evidence) -> RoundInfo:
         """Add the evidence of the round's inference."""
@@ -187,6 +191,21 @@ class Loop:
     def chart(self) -> str:
         """Coordinates in which the domain is a mixture of Gaussians."""
         return chart_of(self.settings, self.env.space)
+
+    def finished(self, state: LoopState) -> bool:
+        """Whether no further round is run."""
+        return int(state.round) >= self.settings.realIters or bool(state.settled)
+
+    def settled(self, before: Distribution | None, after: Distribution | None) -> str:
+        """Say that a posterior is the one before, which its round trained on; "" where it is not."""
+        assert before is not None and after is not None
+        change = after.estimates().apart(before.estimates())
+        if not change <= NEGLIGIBLE:
+            return ""
+        return (
+            f"settled: no median and no end of a 68 % interval has moved by more than {percent(change)} of the prior's "
+            "standard deviation; another round would train on the same physics (bayessim.untilSettled)"
+        )
 
     def key(self, round_: int, purpose: str) -> Array:
         """Every random draw has its own key, a function of the seed alone: a resumed run draws the same."""

@@ -14,13 +14,15 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, TextIO
 
 from bayessim_mjx.config import Config
-from bayessim_mjx.monitor.clock import Clock
+from bayessim_mjx.monitor.clock import Clock, reference
 from bayessim_mjx.monitor.output import Bars, Output
 from bayessim_mjx.monitor.tables import TIE, fit, named, shorten, spoken, without_prefix
 from bayessim_mjx.quantities import compact, duration, estimate, is_number, spread
 
 WIDTHS = "posterior/prior sd"
-COMPILES = "the first start compiles its programs (about a minute on a CPU), later starts load them from the cache"
+# references (`clock.reference`) that the first start of `main --task Pendulum` spends on tracing and compiling; source:
+# benchmarks/records/clock.json
+COMPILES = 200
 NAMES = {"jax": "MJX's JAX implementation", "warp": "MuJoCo Warp"}
 
 
@@ -250,7 +252,9 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
     lines["device"] = str(device)
     if (chosen := getattr(env, "chosen", None)) is not None:
         lines["physics"] = f"{NAMES[chosen.impl]}, taken by env.impl=auto: {chosen.why}"
-    lines |= {"seed": config.seed, "note": COMPILES}
+    seconds = duration(COMPILES * reference(steps=5000)[1])
+    note = f"the first start compiles its programs (the pendulum's: about {seconds} on this machine), "
+    lines |= {"seed": config.seed, "note": f"{note}later starts load them from the cache"}
     return lines
 
 

@@ -161,7 +161,10 @@ class Session:
             self.inference.text("BayesSim/range_ends", "\n\n".join(p.sentence() for p in info.moves), info.round + 1)
         self.flush()
         self.compiling.take()  # the plots' small programs get no line
-        self._phase(info.round + 1)
+        if info.settled:
+            self.console.say(info.settled)
+        else:
+            self._phase(info.round + 1)
 
     def _plots(self, info: RoundInfo) -> None:
         posterior = info.posterior

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from bayessim_mjx.compat import program
+from bayessim_mjx.compat import brief, program
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.rl import actions, catalogue, episodes, losses, networks, normalise, sharding, transitions, worlds
 from bayessim_mjx.rl.checks import check
@@ -113,7 +113,7 @@ def _init(env: Env, config: PPOConfig, mesh: Mesh | None) -> Callable[..., Train
         )
         return sharding.pinned(strong(state), mesh, layout(state))
 
-    return program(run, env)
+    return brief(run)
 
 
 def _begun(learner: Learner, key: jax.Array, sizes: Sizes) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from bayessim_mjx.compat import program
+from bayessim_mjx.compat import brief
 from bayessim_mjx.physics.warp import OVERFLOW
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def _rollout(env: Env, length: int) -> Callable[..., Trajectory]:
             observation = jnp.where(jnp.max(lost) > 0, jnp.nan, observation)
         return Trajectory(observation, action, reward, terminated, truncated, valid, thetas, qpos, qvel, command)
 
-    return program(run, env)
+    return brief(run)
 
 
 def _seen(state: State) -> tuple[jax.Array, jax.Array, jax.Array]:

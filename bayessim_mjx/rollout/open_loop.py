@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from bayessim_mjx.compat import program
+from bayessim_mjx.compat import brief
 from bayessim_mjx.effects.support.motion import AROUND, Motion
 from bayessim_mjx.physics import Drive, Physics, control_step, retraced
 from bayessim_mjx.physics.controllers import Law
@@ -63,7 +63,7 @@ def _replay(physics: Physics) -> Callable[..., dict[str, jax.Array]]:
         _, after = jax.lax.scan(step, world, command)
         return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), world.measurement, after)
 
-    return program(jax.vmap(one), physics)
+    return brief(jax.vmap(one))
 
 
 def started(

@@ -25,13 +25,13 @@ def test_main_stops_only_after_the_rounds_checkpoint() -> None:
     session = types.SimpleNamespace(round=lambda *_: calls.append("round"), flush=lambda: None, wall=wall)
     run = types.SimpleNamespace(save=lambda step, tree, *, meta, **_: calls.append((step, meta["seconds"])))
     stop = cli.Stop()
-    parts = types.SimpleNamespace(settings=types.SimpleNamespace(realIters=2))
+    parts = types.SimpleNamespace(finished=lambda state: state.round == 2)
     watched = main.Watched(session, stop, run, parts)
     stop.requested = True
     watched.round(None, None)
     with pytest.raises(KeyboardInterrupt):
         watched.save(5, {"state": types.SimpleNamespace(round=1)}, meta={})
-    watched.save(10, {"state": types.SimpleNamespace(round=2)}, meta={})  # the last round: nothing is left to stop
+    watched.save(10, {"state": types.SimpleNamespace(round=2)}, meta={})  # the last one: none is left
     assert calls == ["round", (5, 7), (10, 7)]
 
 

@@ -284,7 +284,7 @@ def test_neutral_changes_no_bit(integrator):
 
             return jax.lax.scan(step, p.world(theta, *START), jnp.asarray(COMMAND))[1]
 
-        options = dict.fromkeys(compiler_options(), True)  # bit for bit is a matter of the compiler as users have it
+        options = compiler_options(fused=True)  # bit for bit is a matter of the compiler as users have it
         return jax.jit(run, compiler_options=options)(np.float32(p.space.nominal), drive)
 
     with_all = motion(physics(integrator), Drive(enabled=np.float32(ON)))

@@ -19,7 +19,7 @@ def observations(env, theta):
     actions = jax.random.uniform(jax.random.PRNGKey(1), (STEPS, 2, env.action_size), minval=-1.0)
 
     # bit for bit is a matter of the compiler: as users have it, not as quick as the other tests'
-    @functools.partial(jax.jit, compiler_options=dict.fromkeys(compiler_options(), True))
+    @functools.partial(jax.jit, compiler_options=compiler_options(fused=True))
     def run(theta, actions):
         state = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(jax.random.PRNGKey(0), 2), theta)
 

@@ -113,7 +113,7 @@ def test_a_temperature_undoes_what_was_too_narrow():
     found = calibration.corrected(jax.random.PRNGKey(0), q, theta)
     assert found.before == calibration.OVER and found.verdict == calibration.CALIBRATED
     assert found.temperature == pytest.approx(1 / 0.6, rel=0.2)
-    assert "standard deviations times" in found.words and found.pairs == PAIRS // 2
+    assert "standard deviations times" in found.words and found.pairs == PAIRS // 2 and found.densities == PAIRS
     assert calibration.corrected(jax.random.PRNGKey(0), *posteriors(5)).temperature is None
 
 

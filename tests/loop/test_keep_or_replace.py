@@ -74,7 +74,7 @@ def test_what_is_expected():
 def test_a_network_is_lost_where_its_posteriors_are_no_densities(pairs, lost):
     """Simulations that diverged are nobody's fault."""
     x = jnp.zeros((120, 3)).at[100:].set(jnp.nan)
-    assert round_inference.lost(None if pairs is None else SimpleNamespace(pairs=pairs), x) == lost
+    assert round_inference.lost(None if pairs is None else SimpleNamespace(densities=pairs), x) == lost
 
 
 @pytest.mark.slow

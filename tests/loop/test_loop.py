@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import config, loop, memory, registry, rl
+from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.loop import outer_loop
+from bayessim_mjx.loop.state import Evidence
 from bayessim_mjx.rollout import replay
 
 TINY = [
@@ -188,7 +191,9 @@ def test_under_logs_only_the_newest_evaluation_counts(monkeypatch, truth):
     state = loop.LoopState(**{**blank, "round": jnp.int32(0), "train": train})
     ppo = types.SimpleNamespace(max_iterations=3, save_interval=1)
     parts = types.SimpleNamespace(
-        settings=types.SimpleNamespace(realIters=2, ftuneRL=True), config=types.SimpleNamespace(ppo=ppo)
+        settings=types.SimpleNamespace(realIters=2, ftuneRL=True),
+        config=types.SimpleNamespace(ppo=ppo),
+        finished=lambda state: int(state.round) == 2,
     )
     loop.run(parts, state, saves)
     assert [(t["supersede"], t["evaluation"]) for t in told] == [(truth is None, 2.0)] * 2
@@ -288,3 +293,19 @@ def test_summaries_that_do_not_fit_are_refused(env, monkeypatch):
         loop.make(million, env)
     monkeypatch.setattr(memory, "installed", lambda: 2e6 * 37 * 4)
     loop.make(million, env)
+
+
+@pytest.mark.parametrize(
+    ("means", "done"), [((1.5, 1.0, 1.0, 1.0), 3), ((1.0, 1.01, 1.0, 1.0), 2), ((1.0, 1.2, 1.0, 1.2), 4)]
+)
+def test_a_run_ends_after_a_round_that_leaves_the_posterior_as_it_was(env, monkeypatch, means, done):
+    parts, given = loop.make(settings("bayessim.realIters=4", "bayessim.untilSettled=True"), env), iter(means)
+
+    def infer(of, state, policy):
+        posterior = Distribution.gaussian(env.space, [next(given), 1.0], 0.1, 3)
+        return dataclasses.replace(state, domain=posterior), Evidence()
+
+    monkeypatch.setattr(outer_loop, "infer", infer)
+    state, rounds = loop.run(parts, loop.init(parts))
+    assert int(state.round) == done and parts.finished(state)
+    assert [bool(info.settled) for info in rounds] == [False] * (done - 1) + [done < 4]

@@ -73,7 +73,7 @@ class Rehearsal:
         self.can_switch = windows.batch.enabled is not None
         self.rest = np.median(np.concatenate([log.ctrl for log in windows.logs]), axis=0)
         self.lanes = 0
-        self._run = jax.jit(jax.vmap(self._one), compiler_options=compiler_options())
+        self._run = jax.jit(jax.vmap(self._one), compiler_options=compiler_options(level=None))
 
     @property
     def count(self) -> int:
