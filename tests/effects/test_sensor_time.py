@@ -33,7 +33,7 @@ def sharp_truth():
 
 @pytest.fixture(scope="module")
 def predicted():
-    """Measured qpos and qvel `[25, 4]` of 25 control steps (commands `[25, 10, 2]`) after a start in the middle of a log."""
+    """Measured qpos and qvel `[25, 4]` of 25 control steps (commands `[25, 10, 2]`) that begin within a log."""
     effects = [make(n, where="all") for n in ("sensor_delay", "sensor_filter")]
     physics = Physics(mujoco.MjModel.from_xml_string(SHARP), DT, ParameterSpace(), effects)
 

@@ -171,7 +171,7 @@ class Search:
             self.weighing.score(some)
 
     def _smaller(self) -> None:
-        """The leading set without each of its effects, from where it came to rest.
+        """Fit the leading set without each of its effects, from where it came to rest.
 
         A smaller set was fitted from elsewhere and may rest far off (a payload's mass and lever), so that a further
         effect seemed to be needed.

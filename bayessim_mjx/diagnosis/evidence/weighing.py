@@ -50,8 +50,8 @@ class Weighed:
     def answer(self) -> Key:
         """Of the sets that are as likely as the most likely one (`Odds.mention`), that with the fewest numbers.
 
-        No effects that leave a relevant gap which others of them close: their evidence may rest on one of `doubts`, such
-        as a late sensor, that no simulator gets.
+        No effects that leave a relevant gap which others of them close: their evidence may rest on one of `doubts`,
+        such as a late sensor, that no simulator gets.
         """
         likely = self._within(ODDS.mention)
         least = min(likely, key=self.excess.__getitem__)
@@ -95,7 +95,7 @@ def core(key: Key, excess: Mapping[Key, float]) -> Key:
 
 
 def _limit(excess: Mapping[Key, float], key: Key) -> float:
-    """The most that leaves no relevant part of the gap more than a set."""
+    """Return the most that leaves no relevant part of the gap more than a set."""
     return excess[key] + RELEVANCE.noise + RELEVANCE.share * max(excess[BASE], 0.0)
 
 
