@@ -65,9 +65,10 @@ def test_a_rounds_own_trajectories_are_judged_by_its_own_network(monkeypatch: py
     monkeypatch.setattr(posterior, "conditioned", lambda *_: four(0.6))
     monkeypatch.setattr(posterior, "kept", lambda factors, *_: factors)
     settings = config.load("Pendulum", overrides=["bayessim.realTrajs=2"]).bayessim
-    parts = SimpleNamespace(settings=settings, source=SimpleNamespace(policy_dependent=True))
+    parts = SimpleNamespace(settings=settings, source=SimpleNamespace(policy_dependent=True), feature_size=1)
     fit = SimpleNamespace(identified=None)
-    state = SimpleNamespace(round=1, fit=fit, real_features=None, temperature=1.0, real_posteriors=four(0.3))
+    state = SimpleNamespace(round=1, fit=fit, real_features=np.zeros((4, 1)), temperature=1.0)
+    state.real_posteriors = four(0.3)
     found, warnings = posterior._factors(parts, state)
     assert not warnings
     np.testing.assert_allclose(found.means[:, 0, 0], [0.3, 0.3, 0.6, 0.6], rtol=1e-6)
