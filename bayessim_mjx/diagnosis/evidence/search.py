@@ -221,8 +221,7 @@ class Search:
         key = frozenset(e.label for e in (*kept, case))
         self._likelier({key: scored(state.fitter, fit, (*kept, case))})
         apart = 0.5 * float(np.sum((fit.r - model.fit.r) ** 2))  # nats: what the logs would tell of two such models
-        same = neutral_beyond(case, law, model.values_of(law)) or apart < np.log(ODDS.mention)
-        if key in self.weighing.scored and same:
+        if neutral_beyond(case, law, model.values_of(law)) or apart < np.log(ODDS.mention):
             self.weighing.special[frozenset(e.label for e in model.effects)] = key
 
     def _likelier(self, models: Mapping[Key, Model]) -> None:

@@ -54,8 +54,8 @@ class Weighed:
         such as a late sensor, that no simulator gets.
         """
         likely = self._within(ODDS.mention)
-        least = min(likely, key=self.excess.__getitem__)
-        closing = [k for k in likely if not k or self.excess[k] <= _limit(self.excess, least)]
+        limit = min(self.excess[k] for k in likely) + _relevant(self.excess)
+        closing = [k for k in likely if not k or self.excess[k] <= limit]
         return min(closing, key=lambda k: (len(k), self.numbers[k], -self.weight[k], sorted(k)))
 
     @property
@@ -89,14 +89,14 @@ def core(key: Key, excess: Mapping[Key, float]) -> Key:
     Args:
         excess: {set: held-out squared error above the noise, in noise variances}, of all sets that were fitted.
     """
-    limit = _limit(excess, key)
+    limit = excess[key] + _relevant(excess)
     enough = [k for k in excess if k <= key and excess[k] <= limit]
     return min(enough, key=lambda k: (len(k), excess[k], sorted(k)))
 
 
-def _limit(excess: Mapping[Key, float], key: Key) -> float:
-    """Return the most that leaves no relevant part of the gap more than a set."""
-    return excess[key] + RELEVANCE.noise + RELEVANCE.share * max(excess[BASE], 0.0)
+def _relevant(excess: Mapping[Key, float]) -> float:
+    """Return the smallest difference in `excess` (see `core`) that is a relevant part of the gap."""
+    return RELEVANCE.noise + RELEVANCE.share * max(excess[BASE], 0.0)
 
 
 def weighed(
@@ -209,7 +209,7 @@ class Weighing:
     def settled(self, key: Key) -> bool:
         """Whether a set of effects leaves nothing that matters."""
         left = self.excess([key, BASE])
-        return bool(key) and left[key] <= _limit({**left, key: 0.0}, key)
+        return bool(key) and left[key] <= _relevant(left)
 
     def total(self, key: Key) -> float:
         """Log of evidence and prior over those of the known parameters alone."""
