@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class SensorDelay(Effect):
-    """measured(t) = q(t - d), w(t - d); between control steps the acceleration is taken as constant.
+    """measured(t) = q(t - d), w(t - d); between control steps the velocity is a parabola (`motion.bend`).
 
     Before the first measurement of an episode the first one is taken to have held for ever; an episode that starts in
     the middle of a log takes its past from there.

@@ -17,7 +17,7 @@ from bayessim_mjx.effects.support.site import Site, columns, written
 class SensorPackets(Packets, Effect):
     """measured(t) = q(t - a): the age a is the delay drawn at t, but nothing older is shown than what was shown before.
 
-    Between control steps the acceleration is taken as constant, as by `sensor_delay`. One message serves all joints
+    Between control steps the velocity is a parabola, as by `sensor_delay`. One message serves all joints
     where these are tied ("all"); else each has its own.
 
     Parameters: `delay`, mean of the delay, s, neutral 0; `jitter`, its standard deviation, s, neutral 0; `loss`, share
