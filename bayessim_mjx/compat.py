@@ -149,12 +149,13 @@ def program(function: Callable[..., Any], env: Any = None, **settings: Any) -> A
     return _with(lambda: compiler_options(fused), function, settings)
 
 
-def brief(function: Callable[..., Any], **settings: Any) -> Any:
+def brief(function: Callable[..., Any], level: int | None = 1, **settings: Any) -> Any:
     """`jax.jit(function, **settings)` of a program that runs for less time than it takes to compile.
 
-    Loops over many small numbers (weighing mixtures) take six times as long.
+    Loops over many small numbers (weighing mixtures) take six times as long. Below its last `level` LLVM rounds as it
+    pleases: the same sum in two programs may differ in its last bit.
     """
-    return _with(compiler_options, function, settings)
+    return _with(lambda: compiler_options(level=level), function, settings)
 
 
 def _with(options: Callable[[], dict[str, Any]], function: Callable[..., Any], settings: dict[str, Any]) -> Any:

@@ -63,7 +63,7 @@ def _replay(physics: Physics) -> Callable[..., dict[str, jax.Array]]:
         _, after = jax.lax.scan(step, world, command)
         return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), world.measurement, after)
 
-    return brief(jax.vmap(one))
+    return brief(jax.vmap(one), level=None)  # an effect at neutral changes no bit
 
 
 def started(
