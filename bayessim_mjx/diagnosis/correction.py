@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -116,16 +117,19 @@ def effects_of(diagnosis: Found) -> tuple[Effect, ...]:
 
 def _effect(kind: type[Effect], found: list[FoundEffect]) -> Effect:
     where = found[0].where if len(found) == 1 else tuple(f.where for f in found)
-    plain = kind(where=where)
-    estimates = [e for f in found for e in _in_order(kind, f)]
-    pairs = (pair for block in plain.blocks() for pair in block.pairs())
+    used = [q for q in kind.quantities if not q.optional or any(_acts(q, f.parameters.get(q.name)) for f in found)]
+    estimates = [e for f in found for e in _in_order([q.name for q in used], f)]
+    pairs = ((p, q) for block in kind(where=where).with_all().blocks() for p, q in block.pairs() if q in used)
     identified = (_identified(p, q, e) for (p, q), e in zip(pairs, estimates, strict=True))
-    return dataclasses.replace(plain, parameters=tuple(identified))
+    return kind(where=where, parameters=tuple(identified))
 
 
-def _in_order(kind: type[Effect], found: FoundEffect) -> list[Estimate]:
+def _acts(q: Quantity, e: Estimate | None) -> bool:
+    return e is not None and e.bound != "off" and e.mean != q.neutral
+
+
+def _in_order(names: Sequence[str], found: FoundEffect) -> list[Estimate]:
     """Return the estimates of one place in the order of the effect's quantities."""
-    names = [q.name for q in kind.quantities]
     for name in names:
         if name not in found.parameters or not math.isfinite(found.parameters[name].mean):
             have = ", ".join(found.parameters) or "none"

@@ -1,6 +1,6 @@
-"""Coulomb (dry) friction of joints, with real sticking.
+"""Coulomb (dry) friction of joints, with real sticking or, with a relaxation, as soft as MuJoCo's frictionloss.
 
-Unlike MuJoCo's frictionloss it is not a soft constraint, needs no solver rows, and its level may be zero.
+It needs no rows of MuJoCo's solver, and its level may be zero.
 """
 
 import dataclasses
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 class CoulombFriction(Effect):
     """F = -level sgn(w), set-valued at rest; see `friction.dry`.
 
-    Parameters: `level`, N m (hinge) or N (slide), neutral 0.
+    Parameters: `level`, N m (hinge) or N (slide), neutral 0; `relaxation`, s, neutral 0 and optional: the time
+    constant of MuJoCo's soft friction (`solreffriction`; see `friction.Soft`), without effect where the level is 0.
 
     Attributes:
         high: upper limit of the level, N m or N, unless `parameters` has another range.
@@ -36,10 +37,12 @@ class CoulombFriction(Effect):
     witness: ClassVar[tuple[str, str] | None] = ("temperature", "temperature of motor or gearbox (`temperature`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("level", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),
+        Quantity("relaxation", 0.0, 0.0, 0.04, unit="s", grid=(0.0,), shape=True, optional=True),  # MuJoCo's default is 0.02
     )
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
-        return memory, dry(at, step, at.values(theta)[:, 0])
+        level, *relaxation = at.values(theta).T
+        return memory, dry(at, step, level, *relaxation)
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
         """Native: frictionloss."""

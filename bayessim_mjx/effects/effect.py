@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +92,8 @@ class Effect(abc.ABC):
 
     def _parameter(self, place: str, q: Quantity) -> Parameter:
         label = f"{place}.{self.name}.{q.name}"
-        high = getattr(self, "high", q.high) if len(self.quantities) == 1 else q.high
+        only = not q.optional and sum(not other.optional for other in self.quantities) == 1
+        high = getattr(self, "high", q.high) if only else q.high
         return Parameter(
             label, q.neutral, q.low, high, unit=q.unit, prior=q.prior, attribute=q.name, target=place, kind="effect"
         )
@@ -101,6 +102,12 @@ class Effect(abc.ABC):
         """Return the effect's parameters in the order of `defaults`, with the ranges and priors that hold here."""
         other = {p.name: p for p in self.parameters}
         return ParameterSpace(other.get(p.name, p) for p in self.defaults().parameters)
+
+    def with_all(self) -> Self:
+        """Return the effect with its optional numbers."""
+        every = (self._parameter(place, q) for place in self.places() for q in type(self).quantities)
+        given = {p.name for p in self.parameters}
+        return dataclasses.replace(self, parameters=(*self.parameters, *(p for p in every if p.name not in given)))
 
     def blocks(self, start: int = 0) -> "tuple[Block, ...]":
         """Its numbers by place, the first of them at `start` of theta."""
@@ -120,6 +127,9 @@ class Effect(abc.ABC):
                 raise UserError(f"{p.name}: range ends at {p.high:g} {p.unit}; allowed: up to {q.high:g} (off)")
 
     def __post_init__(self) -> None:
+        named = {p.attribute for p in self.parameters}
+        own = tuple(q for q in type(self).quantities if q.name in named or not q.optional)
+        object.__setattr__(self, "quantities", own)
         high = getattr(self, "high", None)
         if high is not None and not 0 < high < math.inf:
             raise UserError(f"{self.name}: high = {high} {self.quantities[0].unit}, must be positive and finite")

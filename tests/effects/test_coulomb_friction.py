@@ -161,3 +161,42 @@ def test_it_holds_what_hangs_on_another_joint_of_a_loop(integrator, damping):
     gone = 2 * 0.6 if not rate else 2 * (1 - np.exp(-rate * 0.6)) / rate
     np.testing.assert_allclose(away[12.0], 0.0, atol=1e-5)
     np.testing.assert_allclose(away[4.0], gone, rtol=2e-3)
+
+
+def softly(xml, joints, levels, seconds, commands, timestep=0.0005):
+    """Motion `[T, n]` of MuJoCo C with frictionloss, as soft as `seconds`."""
+    spec = mujoco.MjSpec.from_string(xml)
+    spec.option.timestep = timestep
+    for name, level in zip(joints, levels, strict=True):
+        spec.joint(name).frictionloss, spec.joint(name).solref_friction = level, [seconds, 1.0]
+    model = spec.compile()
+    data, rows = mujoco.MjData(model), []
+    for row in commands:
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data, round(DT / timestep))
+        rows.append(data.qpos.copy())
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(("seconds", "within"), [(0.02, 0.12), (0.1, 0.05)])
+def test_relaxes_as_mujocos_soft_friction(seconds, within):
+    """An arm of two joints, under gravity: the change of its motion against rigid friction, to 12 and 5 % of its size."""
+    joints, levels = ("shoulder", "elbow"), (6.0, 2.0)
+    t = DT * np.arange(100)
+    commands = 5 * np.sin(8 * t)[:, None]
+    truth = softly(ARM, joints, levels, seconds, commands)
+    effects = [make("coulomb_friction", where=j, high=20.0).with_all() for j in joints]
+    p = Physics(mujoco.MjModel.from_xml_string(ARM.replace("0.002", "0.0005")), DT, ParameterSpace(), effects)
+    assert p.space.names[1] == "shoulder.coulomb_friction.relaxation"
+
+    def body(world, command):
+        world, _ = control_step(p, world, command)
+        return world, world.qpos
+
+    def moved(relaxation):
+        theta = jnp.array([levels[0], relaxation, levels[1], relaxation])
+        return jax.lax.scan(body, p.world(theta), jnp.asarray(commands, jnp.float32))[1]
+
+    rigid, soft = map(np.asarray, jax.jit(jax.vmap(moved))(jnp.array([0.0, seconds])))
+    assert np.abs(truth - rigid).max() > 0.05
+    assert np.abs(truth - soft).max() < within * np.abs(truth - rigid).max()

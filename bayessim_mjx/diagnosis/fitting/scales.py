@@ -217,7 +217,7 @@ def ranges(effect: type[Effect], place: str, scales: Scales) -> tuple[Parameter,
         UserError: a quantity grows with something that its kind of place does not have.
     """
     here = scales.at(effect.kind, place)
-    (block,) = effect(where=place).blocks()
+    (block,) = effect(where=place).with_all().blocks()
     return tuple(_ranged(p, q, here, effect) for p, q in block.pairs())
 
 

@@ -120,11 +120,19 @@ def numbered(effect: FoundEffect) -> str:
     """
     own = words(effect.name)
     name = own.noun if own.lacks.startswith(WRONG) else own.lacks
-    if len(effect.parameters) == 1:
-        ((_, value),) = (quantity(k, v) for k, v in effect.parameters.items())
+    used = _used(effect)
+    if len(used) == 1:
+        ((_, value),) = (quantity(k, v) for k, v in used.items())
         return own.at(effect.where, f"{name} of {value}")
     numbers = _numbers(effect)
     return own.at(effect.where, name) + (f" ({numbers})" if numbers else "")
+
+
+def _used(effect: FoundEffect) -> dict[str, Estimate]:
+    """Return an effect's numbers without those that are optional and near neutral."""
+    kind = library.known(effect.name)
+    optional = {q.name for q in kind.quantities if q.optional} if kind else set()
+    return {k: v for k, v in effect.parameters.items() if k not in optional or _clear(effect.name, k, v)}
 
 
 def _numbers(effect: FoundEffect) -> str:

@@ -77,7 +77,7 @@ def of(physics: Physics, coordinate: Coordinate, value: float) -> Bound | None:
         return None
     quantity = physics.quantity(coordinate.index[0])
     at = getattr(coordinate, end)
-    if at == quantity.neutral and not quantity.shape:
+    if at == quantity.neutral and (quantity.optional or not quantity.shape):
         return Bound("off", at)
     least, most = quantity.ends()
     if at == (most if end == "high" else least):

@@ -14,10 +14,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 SWEEPS = 2
+DMIN, DMAX = 0.9, 0.95  # MuJoCo's default solimp
 _SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
-def resist(at: Site, step: SubStep, level: jax.Array, damping: jax.Array) -> jax.Array:
+def resist(
+    at: Site, step: SubStep, level: jax.Array, damping: jax.Array, relaxation: jax.Array | None = None
+) -> jax.Array:
     """Generalised force `[nv]` of friction that opposes the motion and never reverses it.
 
     F = -(level + damping |w|) sgn(w), w at the *end* of the sub-step (implicit: stable for any damping). At rest F is
@@ -28,7 +31,9 @@ def resist(at: Site, step: SubStep, level: jax.Array, damping: jax.Array) -> jax
     Args:
         level: `[n, 2]` >= 0, dry friction against forward (w > 0) and against backward motion, N m (hinge) or N.
         damping: `[n, 2]` >= 0, likewise, N m s/rad or N s/m.
+        relaxation: `[n]` >= 0, s, of MuJoCo's soft constraint (`Soft`); None: dry friction holds at once and for good.
     """
+    soft = None if relaxation is None else Soft(at, step, relaxation)
     inverse, dt = step.inverse, step.dt
     force = step.last[at.dadr]
     pull = step.force + at.scatter(force)
@@ -37,8 +42,9 @@ def resist(at: Site, step: SubStep, level: jax.Array, damping: jax.Array) -> jax
         for i, dof in enumerate(at.dadr):
             gain = dt * inverse[dof, dof]  # dw/dF
             stop = force[i] - speed[dof] / gain  # the force that would bring the joint to rest
+            asked = stop if soft is None else soft(i, stop, gain)
             # no clip: at level 0 its derivative in the level would be lost
-            held = jnp.where(stop < -level[i, 0], -level[i, 0], jnp.where(stop > level[i, 1], level[i, 1], stop))
+            held = jnp.where(asked < -level[i, 0], -level[i, 0], jnp.where(asked > level[i, 1], level[i, 1], asked))
             left = gain * (held - stop)  # the speed that dry friction leaves; 0 where it holds
             slope = jnp.where(left > 0, damping[i, 0], damping[i, 1])
             new = held - slope * left / (1.0 + gain * slope)
@@ -47,10 +53,29 @@ def resist(at: Site, step: SubStep, level: jax.Array, damping: jax.Array) -> jax
     return at.scatter(force)
 
 
-def dry(at: Site, step: SubStep, level: jax.Array) -> jax.Array:
+class Soft:
+    """MuJoCo's friction as a soft constraint: below its level F = -(dw/dt + b w) / R, b = 2 / (dmax T), T = relaxation.
+
+    So a joint that it holds gives way to a load slowly, and comes to rest within some T. R = (1 - dmin) / dmin times the
+    joint's inverse inertia in the model's rest pose. MuJoCo's documentation, "Computation", constraint model; dmin and
+    dmax are those of its default solimp. Here w is the speed at the end of the sub-step, so as T goes to 0 it is rigid.
+    """
+
+    def __init__(self, at: Site, step: SubStep, relaxation: jax.Array) -> None:
+        self.speed, self.dt = step.qvel[at.dadr], step.dt
+        self.weak = (1 - DMIN) / DMIN * step.model.dof_invweight0[at.dadr]
+        self.time = DMAX / 2 * relaxation
+
+    def __call__(self, i: int, stop: jax.Array, gain: jax.Array) -> jax.Array:
+        """Force below the level, where `stop` would bring the joint to rest and gain is dw/dF."""
+        stiff, time = gain * (self.time[i] + self.dt), self.time[i]
+        return (stiff * stop + time * self.speed[i]) / (stiff + self.weak[i] * self.dt * time)
+
+
+def dry(at: Site, step: SubStep, level: jax.Array, relaxation: jax.Array | None = None) -> jax.Array:
     """Generalised force `[nv]` of dry friction up to `level` `[n]` (>= 0) in both directions; see `resist`."""
     both = jnp.stack([level, level], axis=-1)
-    return resist(at, step, both, jnp.zeros_like(both))
+    return resist(at, step, both, jnp.zeros_like(both), relaxation)
 
 
 def viscous(at: Site, step: SubStep, damping: jax.Array) -> jax.Array:
@@ -69,11 +94,11 @@ def native(spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> "Iterato
 
 
 def lose(spec: mujoco.MjSpec, levels: dict[str, dict[str, float]]) -> None:
-    """Write dry friction, `levels[place]["level"]`: as stiff as MuJoCo allows (two timesteps), so it slips least."""
+    """Write dry friction, `levels[place]["level"]`, with its relaxation: MuJoCo allows two timesteps at the least."""
     for joint, own in native(spec, levels):
         if own["level"]:
             add(joint, "frictionloss", own["level"])
-            joint.solref_friction = [2.0 * spec.option.timestep, 1.0]
+            joint.solref_friction = [max(own.get("relaxation", 0.0), 2.0 * spec.option.timestep), 1.0]
 
 
 def add(joint: Any, field: str, value: float) -> None:

@@ -35,6 +35,8 @@ class Quantity:
         most: end that physics sets, whatever the range is (friction that outgrows its load).
         stated: a data sheet states it: its prior is Gaussian, and STATED of its standard deviations make the range.
         remembered: the range sizes the effect's memory, so that no fit can go beyond it.
+        optional: it is an entry of theta only where the effect's `parameters` name it (a range was given, or a
+            diagnosis tries it); elsewhere it is neutral.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Quantity:
     most: float = math.inf
     stated: bool = False
     remembered: bool = False
+    optional: bool = False
 
     @property
     def deviation(self) -> float:

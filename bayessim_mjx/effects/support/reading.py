@@ -77,7 +77,7 @@ def stack(section: Mapping[str, Any], effects: Sequence[Effect] = ()) -> tuple[E
 
 def _ranged(effect: Effect, place: str, settings: Mapping[str, Any], path: str) -> Effect:
     """Give the effect other ranges and priors at one place."""
-    own = {p.attribute: p for block in effect.blocks() if block.place == place for p in block.parameters}
+    own = {p.attribute: p for block in effect.with_all().blocks() if block.place == place for p in block.parameters}
     changed = {}
     for label, setting in settings.items():
         if label not in own:
