@@ -64,7 +64,8 @@ class Soft:
     def __init__(self, at: Site, step: SubStep, relaxation: jax.Array) -> None:
         self.speed, self.dt = step.qvel[at.dadr], step.dt
         self.weak = (1 - DMIN) / DMIN * step.model.dof_invweight0[at.dadr]
-        self.time = DMAX / 2 * relaxation
+        time = DMAX / 2 * relaxation
+        self.time = time * (time + step.dt / 2) / (time + step.dt)  # an implicit sub-step lags by half of it
 
     def __call__(self, i: int, stop: jax.Array, gain: jax.Array) -> jax.Array:
         """Force below the level, where `stop` would bring the joint to rest and gain is dw/dF."""
