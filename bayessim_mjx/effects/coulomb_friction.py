@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.friction import dry, lose
+from bayessim_mjx.effects.support.friction import Soft, dry, lose
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
@@ -42,7 +42,7 @@ class CoulombFriction(Effect):
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
         level, *relaxation = at.values(theta).T
-        return memory, dry(at, step, level, *relaxation)
+        return memory, dry(at, step, level, Soft(at, step, *relaxation) if relaxation else None)
 
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
         """Native: frictionloss."""

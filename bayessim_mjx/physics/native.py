@@ -1,4 +1,4 @@
-"""Forces of MuJoCo that MJX leaves out: polynomials of joints are added, the rest is moved to joints or refused."""
+"""Forces of MuJoCo that MJX leaves out, or is slow at: they are added, moved to joints or refused."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -9,10 +9,12 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Quantity
+from bayessim_mjx.effects.support.friction import Soft, dry
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
 _AXIAL = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+_LEAST = 1e-9  # 1/s, keeps a quotient finite
 _ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 # field of the model: (what it is, what to write in its place)
 _ABSENT = {
@@ -49,6 +51,35 @@ class PolynomialForces(Effect):
         drag = (damping[:, 0] * jnp.abs(v) + damping[:, 1] * v**2) * v
         pull = (spring[:, 0] * x + spring[:, 1] * x**2) * x
         return memory, at.scatter(-drag - pull)
+
+
+@dataclasses.dataclass(frozen=True)
+class FrictionLoss(Effect):
+    """The model's own frictionloss at hinges and slides, where no solver is to iterate for it; see `friction.Soft`.
+
+    It has no parameters and is no candidate.
+    """
+
+    name: ClassVar[str] = "friction_loss"
+    kind: ClassVar[str] = "joint"
+    quantities: ClassVar[tuple[Quantity, ...]] = ()
+
+    def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
+        model = at.mj_model
+        dmin, dmax = model.dof_solimp[at.dadr, :2].T
+        direct, (constant, damping) = model.dof_solref[at.dadr, 0] <= 0, model.dof_solref[at.dadr].T
+        constant = np.where(direct, 2 / np.maximum(-damping, _LEAST), np.maximum(constant, 2 * model.opt.timestep))
+        soft = Soft(at, step, jnp.asarray(constant, jnp.float32), dmin, dmax)
+        return memory, dry(at, step, step.model.dof_frictionloss[at.dadr], soft)
+
+
+def rubbing(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Names of the joints whose frictionloss `FrictionLoss` may be; () where others have one, or it is switched off."""
+    off = int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
+    joints = np.unique(model.dof_jntid[model.dof_frictionloss > 0])
+    if off or model.tendon_frictionloss.any() or not np.isin(model.jnt_type[joints], _AXIAL).all():
+        return ()
+    return tuple(model.joint(int(j)).name or f"joint{j}" for j in joints)
 
 
 def own_forces(model: mujoco.MjModel) -> tuple[Effect, ...]:

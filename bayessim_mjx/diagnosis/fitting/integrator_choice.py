@@ -24,6 +24,7 @@ from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, simula
 from bayessim_mjx.diagnosis.fitting.observation import Stepper
 from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts
 from bayessim_mjx.logs.log import Channels, Log
+from bayessim_mjx.physics.native import rubbing
 
 Array = NDArray[np.float64]
 # (robot's physics, first=coarsest stable factor) -> (the windows, the error of the time step)
@@ -118,7 +119,9 @@ class Choice:
 
 
 def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, left: float = np.inf) -> Choice:
-    """Return the coarsest stable step; by RK4 where nothing can touch, the logs have noise and there is time.
+    """Return the coarsest stable step; where nothing can touch and the logs have noise, by RK4 if there is time.
+
+    There frictionloss needs no solver either.
 
     Logs of a simulation may have been made by the model's own integrator.
 
@@ -127,6 +130,7 @@ def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, lef
     """
     own = robot.physics(dt)
     precise = not contacts(own) and not simulated(own.mj_model, logs).all()
+    robot = dataclasses.replace(robot, rubbing=rubbing(robot.mj_model) if precise else ())
     stable = coarsest_stable(own.mj_model, logs, precise)
     better = stable.robot(robot)
     cuts, worth = measured(better.physics(dt), first=stable.factor)

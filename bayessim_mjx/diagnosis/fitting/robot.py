@@ -20,7 +20,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import ParameterSpace, elements
 from bayessim_mjx.physics import Physics
-from bayessim_mjx.physics.native import moved_to_joints
+from bayessim_mjx.physics.native import FrictionLoss, moved_to_joints
 from bayessim_mjx.physics.visuals import needs_geoms, with_options, without_meshes, without_visuals
 
 if TYPE_CHECKING:
@@ -60,6 +60,7 @@ class Robot:
         assumed: those of them whose accuracy nobody stated.
         unlimited: joints whose limits its physics leaves out; rounds: most iterations of its solver (`pruned`).
         urdf: the URDF file that it was read from, if it was.
+        rubbing: joints whose frictionloss is simulated without the solver (`native.FrictionLoss`).
         lean: the model that is simulated with the options of `mj_model`, where that one has meshes only to look at.
     """
 
@@ -76,6 +77,7 @@ class Robot:
     rounds: int | None = None
     urdf: Path | None = None
     lean: mujoco.MjModel | None = None
+    rubbing: tuple[str, ...] = ()
 
     def stated(self, accuracy: Sequence[str] = (), payload: Sequence[str] = ()) -> "Robot":
         """With what was said of its data sheet, as `--accuracy` and `--payload` (`data_sheet`)."""
@@ -99,6 +101,9 @@ class Robot:
         if self.rounds is not None:
             model.opt.iterations = min(self.rounds, model.opt.iterations)
             model.opt.ls_iterations = min(self.rounds, model.opt.ls_iterations)
+        if self.rubbing:
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
+            effects = (*effects, FrictionLoss(self.rubbing))
         return Physics(model, control_dt, self.space if space is None else space, effects, self.max_qvel)
 
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.typing import ArrayLike
 
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
@@ -19,7 +20,7 @@ _SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 def resist(
-    at: Site, step: SubStep, level: jax.Array, damping: jax.Array, relaxation: jax.Array | None = None
+    at: Site, step: SubStep, level: jax.Array, damping: jax.Array, soft: "Soft | None" = None
 ) -> jax.Array:
     """Generalised force `[nv]` of friction that opposes the motion and never reverses it.
 
@@ -31,9 +32,8 @@ def resist(
     Args:
         level: `[n, 2]` >= 0, dry friction against forward (w > 0) and against backward motion, N m (hinge) or N.
         damping: `[n, 2]` >= 0, likewise, N m s/rad or N s/m.
-        relaxation: `[n]` >= 0, s, of MuJoCo's soft constraint (`Soft`); None: dry friction holds at once and for good.
+        soft: how dry friction yields below its level; None: it holds at once and for good.
     """
-    soft = None if relaxation is None else Soft(at, step, relaxation)
     inverse, dt = step.inverse, step.dt
     force = step.last[at.dadr]
     pull = step.force + at.scatter(force)
@@ -54,17 +54,23 @@ def resist(
 
 
 class Soft:
-    """MuJoCo's friction as a soft constraint: below its level F = -(dw/dt + b w) / R, b = 2 / (dmax T), T = relaxation.
+    """MuJoCo's friction as a soft constraint: below its level F = -(dw/dt + b w) / R.
 
-    So a joint that it holds gives way to a load slowly, and comes to rest within some T. R = (1 - dmin) / dmin times the
-    joint's inverse inertia in the model's rest pose. MuJoCo's documentation, "Computation", constraint model; dmin and
-    dmax are those of its default solimp. Here w is the speed at the end of the sub-step, so as T goes to 0 it is rigid.
+    So a joint that it holds gives way to a load slowly, and comes to rest within some 1 / b = dmax T / 2, T the time
+    constant in its solref. R = (1 - dmin) / dmin times the joint's inverse inertia in the model's rest pose. MuJoCo's
+    documentation, "Computation", constraint model. Here w is the speed at the end of the sub-step, so as T goes to 0 it
+    is rigid.
+
+    Args:
+        constant: `[n]` T, s; dmin, dmax: of its solimp, numbers or `[n]`.
     """
 
-    def __init__(self, at: Site, step: SubStep, relaxation: jax.Array) -> None:
+    def __init__(
+        self, at: Site, step: SubStep, constant: jax.Array, dmin: ArrayLike = DMIN, dmax: ArrayLike = DMAX
+    ) -> None:
         self.speed, self.dt = step.qvel[at.dadr], step.dt
-        self.weak = (1 - DMIN) / DMIN * step.model.dof_invweight0[at.dadr]
-        time = DMAX / 2 * relaxation
+        self.weak = (1 - dmin) / dmin * step.model.dof_invweight0[at.dadr]
+        time = dmax / 2 * constant
         self.time = time * (time + step.dt / 2) / (time + step.dt)  # an implicit sub-step lags by half of it
 
     def __call__(self, i: int, stop: jax.Array, gain: jax.Array) -> jax.Array:
@@ -73,10 +79,10 @@ class Soft:
         return (stiff * stop + time * self.speed[i]) / (stiff + self.weak[i] * self.dt * time)
 
 
-def dry(at: Site, step: SubStep, level: jax.Array, relaxation: jax.Array | None = None) -> jax.Array:
+def dry(at: Site, step: SubStep, level: jax.Array, soft: Soft | None = None) -> jax.Array:
     """Generalised force `[nv]` of dry friction up to `level` `[n]` (>= 0) in both directions; see `resist`."""
     both = jnp.stack([level, level], axis=-1)
-    return resist(at, step, both, jnp.zeros_like(both), relaxation)
+    return resist(at, step, both, jnp.zeros_like(both), soft)
 
 
 def viscous(at: Site, step: SubStep, damping: jax.Array) -> jax.Array:
