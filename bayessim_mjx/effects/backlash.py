@@ -19,10 +19,11 @@ class Backlash(transmission.OfTransmission, Effect):
 
     J w_m' = tau - d w_m - s, link moved by s, |q_m - q| <= gap, s = 0 inside. The motor is that of `joint_elasticity`:
     its inertia J is the joint's armature, or a fifth of what is felt at the joint, d the joint's damping. The sensors
-    show the link; position servos see the motor. Teeth do not bounce. At the start the load has pushed the motor to one
+    show the link, or the motor; position servos see the motor. Teeth do not bounce. At the start the load has pushed the motor to one
     end of the gap; where a recording leads up to the start, the motor is where this brought it.
 
-    Parameters: `gap`, half of the play, rad (hinge) or m (slide), neutral 0.
+    Parameters: `gap`, half of the play, rad (hinge) or m (slide), neutral 0; the optional `encoder` (0 on the link, 1 on
+    the motor), without effect where the gap is 0.
     """
 
     name: ClassVar[str] = "backlash"
@@ -33,6 +34,7 @@ class Backlash(transmission.OfTransmission, Effect):
     witness = LINK_ENCODER
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("gap", 0.0, 0.0, 0.05, unit="rad", per="travel", reach=(0.0, 0.1), grid=(0.03, 0.1, 0.4)),
+        transmission.ENCODER,
     )
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
@@ -48,4 +50,4 @@ class Backlash(transmission.OfTransmission, Effect):
         side = jnp.where(jnp.abs(twist) > gap, jnp.sign(twist), 0.0)
         passed = solve(jnp.where(solve(side).torque * side > 0, side, 0.0))
         twist = jnp.where(fresh, gap * jnp.sign(passed.torque), both.twist)
-        return transmission.finish(at, step, both, passed, twist)
+        return transmission.finish(at, memory, step, both, passed, twist, self.encoder(at, theta))

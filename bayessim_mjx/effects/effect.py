@@ -172,12 +172,14 @@ class Effect(abc.ABC):
         """
         return memory, motion
 
-    def on_record(self, at: Site, memory: Any, before: "Measurement", after: "Measurement", theta: jax.Array) -> Any:
-        """Return the memory where a recorded state, `after`, replaces the simulated one, `before`, at the same time.
+    def on_record(
+        self, at: Site, memory: Any, before: "Measurement", after: "Measurement", theta: jax.Array
+    ) -> "tuple[Any, Measurement]":
+        """Change the recorded state `after` that replaces the simulated one, `before`, at the same time.
 
         Only called along the recorded past of what `follows` the motion.
         """
-        return memory
+        return memory, after
 
     def on_command(self, at: Site, memory: Any, command: jax.Array, theta: jax.Array) -> tuple[Any, jax.Array]:
         """Change the command of one control step, `[substeps, nu]`: one row per sub-step (four of them by RK4)."""

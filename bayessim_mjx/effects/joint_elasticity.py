@@ -18,12 +18,12 @@ class JointElasticity(transmission.OfTransmission, Effect):
     """J w_m' = tau - d_j w_m - s, link moved by s = k (q_m - q) + d (w_m - w), d = 2 zeta sqrt(k J_s).
 
     The actuators turn the motor, whose inertia J is the joint's armature (taken off the link), or a fifth of what is
-    felt at the joint where the model has none; J_s is the inertia of motor against link. The sensors show the link;
-    position servos see the motor. The joint's damping d_j is the motor's; its friction stays with the link. At the
+    felt at the joint where the model has none; J_s is the inertia of motor against link. The sensors show the link,
+    or the motor; position servos see the motor. The joint's damping d_j is the motor's; its friction stays with the link. At the
     start the spring is wound up by the torque that a rigid joint would pass on, or as the recording before it says.
 
-    Parameters: `compliance` 1/k, rad/(N m) (hinge) or m/N (slide), neutral 0; `damping` zeta, without effect where the
-    compliance is 0.
+    Parameters: `compliance` 1/k, rad/(N m) (hinge) or m/N (slide), neutral 0; `damping` zeta and the optional `encoder`
+    (0 on the link, 1 on the motor), without effect where the compliance is 0.
     """
 
     name: ClassVar[str] = "joint_elasticity"
@@ -38,12 +38,13 @@ class JointElasticity(transmission.OfTransmission, Effect):
             "compliance", 0.0, 0.0, 0.05, unit="rad/(N m)", per="1/force", reach=(0.0, 0.3), grid=(0.01, 0.03, 0.1, 0.3)
         ),
         Quantity("damping", 0.1, 0.02, 1.5, grid=(0.05,), shape=True),
+        transmission.ENCODER,
     )
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
         on = self.on(at, theta)
         both = transmission.sides(at, memory, step, on, self.mark)
-        compliance, ratio = at.values(theta).T
+        compliance, ratio, *_ = at.values(theta).T
         soft = jnp.where(on & ~memory["fresh"], compliance, 0.0)
         period = jnp.where(on, soft * both.series, 0.0)  # J_s / k
         root = jnp.sqrt(jnp.where(period > 0, period, 1.0))
@@ -53,4 +54,4 @@ class JointElasticity(transmission.OfTransmission, Effect):
         late = step.dt * jnp.maximum(1.0 - squares, 0.0)
         passed = transmission.transmit(both, step.dt, soft, loss, late, jnp.zeros(len(at)), on)
         twist = jnp.where(memory["fresh"], compliance * passed.torque, both.twist)
-        return transmission.finish(at, step, both, passed, twist)
+        return transmission.finish(at, memory, step, both, passed, twist, self.encoder(at, theta))

@@ -219,13 +219,16 @@ class Physics:
         return [i for i, effect in enumerate(self.effects) if overrides(effect, hook)]
 
     def encoders(
-        self, thetas: tuple, qpos: jax.Array, qvel: jax.Array, active: jax.Array | None = None
+        self, thetas: tuple, memory: tuple, qpos: jax.Array, qvel: jax.Array, active: jax.Array | None = None
     ) -> tuple[jax.Array, jax.Array]:
         """(qpos, qvel) as the joints' own encoders show them to their drives: with the sensors' static errors.
 
-        Delays and filters lie between the drive and whoever records; without a past they show what is.
+        Delays and filters lie between the drive and whoever records; without a past they show what is. memory: of the
+        effects, which says where motors stand beside their links.
         """
-        shown = self.sense(thetas, self._memory, {"qpos": qpos, "qvel": qvel}, active)[1]
+        each = zip(self.effects, memory, self._memory, strict=True)
+        now = tuple(new if effect.follows else old for effect, new, old in each)
+        shown = self.sense(thetas, now, {"qpos": qpos, "qvel": qvel}, active)[1]
         return shown["qpos"], shown["qvel"]
 
     def model_of(self, world: World) -> mjx.Model:

@@ -211,15 +211,16 @@ class Past(struct.PyTreeNode):
         return jax.lax.cond(k < self.steps, along, lambda: jax.lax.cond(k == self.steps, arrived, lambda: world))
 
     def arrived(self, world: World) -> World:
-        """Return the start with the memory of what followed the motion up to it; world: after the last step."""
+        """Return the start as what followed the motion up to it leaves it; world: after the last step."""
 
         def kept(new: jax.Array, old: jax.Array) -> jax.Array:
             return jnp.where(self.wanted, new, old)
 
-        own = self._recorded(world, self.start.replace(memory=world.memory)).memory
-        each = zip(self.physics.effects, own, self.start.memory, strict=True)
+        own = self._recorded(world, self.start.replace(memory=world.memory))
+        each = zip(self.physics.effects, own.memory, self.start.memory, strict=True)
         memory = (jax.tree.map(kept, new, old) if effect.follows else old for effect, new, old in each)
-        return self.start.replace(memory=tuple(memory))
+        qpos, qvel = kept(own.qpos, self.start.qpos), kept(own.qvel, self.start.qvel)
+        return self.start.replace(memory=tuple(memory), qpos=qpos, qvel=qvel)
 
     def _recorded(self, before: World, after: World) -> World:
         """`after`, a recorded state with the memories of `before`, as what follows the motion takes it."""
@@ -227,8 +228,8 @@ class Past(struct.PyTreeNode):
         thetas = self.physics.split(before.theta)[1]
         memory = list(after.memory)
         for i in self.physics.having("on_record"):
-            memory[i] = self.physics.effects[i].on_record(self.physics.sites[i], memory[i], old, new, thetas[i])
-        return after.replace(memory=tuple(memory))
+            memory[i], new = self.physics.effects[i].on_record(self.physics.sites[i], memory[i], old, new, thetas[i])
+        return after.replace(memory=tuple(memory), **new)
 
 
 def past_of(physics: Physics, start: World, motion: Motion, active: jax.Array | None = None) -> Past:

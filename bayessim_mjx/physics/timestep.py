@@ -105,7 +105,7 @@ def forward(own: Timestep, data: mjx.Data, carry: Memory) -> tuple[mjx.Data, Mem
     data = mjx.fwd_velocity(model, data)
     data = mjx.sensor_vel(model, data) if sensors else data
     if own.drive.law is not None:
-        seen = physics.encoders(own.thetas, data.qpos, data.qvel, own.drive.active)
+        seen = physics.encoders(own.thetas, carry[0], data.qpos, data.qvel, own.drive.active)
         law = own.drive.law
         for _, effect, site, theta in own.having("on_law"):
             law = effect.on_law(site, law, theta)

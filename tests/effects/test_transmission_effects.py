@@ -167,6 +167,36 @@ def test_backlash_is_play_between_two_bodies(gap):
         assert np.abs(q - real).max() < 0.2 * np.abs(without - real).max()
 
 
+def weightless(xml):
+    return mujoco.MjModel.from_xml_string(xml.replace("<option ", '<option gravity="0 0 0" '))
+
+
+@pytest.mark.slow
+@pytest.mark.ci
+@pytest.mark.parametrize(("actuator", "integrator", "size"), [(TORQUE, "Euler", 1.0), (SERVO, "implicitfast", 0.4)])
+def test_an_encoder_on_the_motor_shows_the_motor(actuator, integrator, size):
+    """Without gravity, which would notice that at the start the link stands where its encoder does."""
+    own = Physics(
+        weightless(model(actuator, integrator)),
+        0.02,
+        ParameterSpace(),
+        [effect.with_all() for effect in stack()],
+    )
+    gap, command, stiffness = 0.03, size * PUSHED, (2 * np.pi * 5) ** 2 * SERIES
+    play = f'limited="true" range="-{gap} {gap}" solreflimit=".001 1"'
+    spring = f'stiffness="{stiffness}" damping="{0.2 * np.sqrt(stiffness * SERIES)}"'
+    rows = [[0, 0.1, 0, gap, 1], [1 / stiffness, 0.1, 1, 0, 0], [0, 0.1, 0, gap, 0], [1 / stiffness, 0.1, 0, 0, 0]]
+    for motor, link, between, start in ((0, 2, play, gap * np.sign(command[0, 0])), (1, 3, spring, 0.0)):
+        two = weightless(TWO.format(between=between, actuator=actuator.format("motor")))
+        shown = moved(own, np.array(rows), command, qpos=[start])[..., 0]
+        coarse, fine = (
+            truth(weightless(model(actuator, integrator, dt=dt)), command, qpos=[start])[:, 0] for dt in (0.002, 0.0002)
+        )
+        real = truth(two, command, qpos=[0, start])[:, 1] + coarse - fine
+        apart = np.abs(shown[motor] - shown[link]).max()
+        assert apart > 0.8 * gap and np.abs(shown[motor] - real).max() < 0.2 * apart
+
+
 @pytest.mark.slow
 @pytest.mark.ci
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])

@@ -73,6 +73,44 @@ def test_a_spring_is_wound_up_as_the_recorded_motion_left_it():
     assert np.sqrt(np.mean(off**2)) < 0.65 * np.std(true)
 
 
+@pytest.mark.parametrize(("name", "value"), [("backlash", (0.03, 1.0)), ("joint_elasticity", (0.1, 0.1, 1.0))])
+def test_a_link_is_where_its_motors_recorded_motion_brought_it(name, value):
+    """What is shown goes on as it was recorded: simulated from its middle, the motor is nearer to what it did."""
+    physics = Physics(
+        mujoco.MjModel.from_xml_string(MODEL.format("Euler")),
+        DT,
+        ParameterSpace([]),
+        [make(name, where="link").with_all()],
+    )
+    theta, ahead = jnp.asarray(value, jnp.float32), 5
+
+    def step(world, command):
+        after = control_step(physics, world, command)[0]
+        return after, world
+
+    _, worlds = jax.jit(lambda w: jax.lax.scan(step, w, jnp.asarray(COMMAND)))(physics.world(theta))
+    shown = worlds.measurement
+    near = np.arange(BEFORE, ROWS - BEFORE)[:, None] + np.arange(-BEFORE, BEFORE + 1)
+    commands = np.repeat(COMMAND[near][:, :, None], physics.substeps, 2)
+    motion = Motion(shown["qpos"][near], shown["qvel"][near], jnp.asarray(commands), start=BEFORE)
+
+    def goes_on(how, one):
+        def step(k, world):
+            return control_step(physics, world, one.command[BEFORE + k])[0]
+
+        start = how(physics, theta, one)
+        return physics.sense((theta,), start.memory, {"qpos": start.qpos, "qvel": start.qvel})[1], jax.lax.fori_loop(
+            0, ahead, step, start
+        ).measurement
+
+    off = {}
+    for how in (begin, retraced):
+        first, after = jax.jit(jax.vmap(functools.partial(goes_on, how)))(motion)
+        np.testing.assert_allclose(first["qpos"], motion.qpos[:, BEFORE], atol=1e-5)
+        off[how] = np.sqrt(np.mean((np.asarray(after["qpos"]) - motion.qpos[:, BEFORE + ahead]) ** 2))
+    assert off[retraced] < {"backlash": 0.6, "joint_elasticity": 0.8}[name] * off[begin], off
+
+
 def test_a_start_is_as_measured_and_without_such_effects_nothing_is_retraced():
     physics, theta, worlds, motion = recorded("backlash", (0.03,))
     one = jax.tree.map(lambda x: x[20], motion)

@@ -115,7 +115,7 @@ def _called(effect: "Effect", at: Site, model: "mjx.Model", hook: str, theta: ja
     before, call = {
         "on_model": (model, lambda: (memory, effect.on_model(at, model, theta))),
         "on_start": (given["motion"], lambda: effect.on_start(at, memory, given["motion"], theta)),
-        "on_record": (shown, lambda: (effect.on_record(at, memory, shown, shown, theta), shown)),
+        "on_record": (shown, lambda: effect.on_record(at, memory, shown, shown, theta)),
         "on_command": (given["command"], lambda: effect.on_command(at, memory, given["command"], theta)),
         "on_actuator": (given["force"], actuator),
         "on_force": (jnp.zeros(at.nv), lambda: effect.on_force(at, memory, step, theta)),

@@ -7,20 +7,21 @@ on the motor's side, where their encoder is. The joint's damping is the motor's 
 with the reduction's square count there.
 """
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from bayessim_mjx.effects.support.quantity import Quantity
 from bayessim_mjx.effects.support.site import Site, joint_dofs, ranges
 from bayessim_mjx.effects.support.substep import SubStep
 
 if TYPE_CHECKING:
     from mujoco import mjx
 
+Measurement: TypeAlias = dict[str, jax.Array]  # {"qpos": [nq], "qvel": [nv]}
 SHARE = 0.2  # of the joint's inertia is the motor's where the model has no armature
 REAL = 2.0**-10  # armature below this part of the joint's inertia counts as none
 _EULER = int(mujoco.mjtIntegrator.mjINT_EULER)
@@ -28,8 +29,13 @@ _IMPLICIT, _RK4 = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST), int(mujoco.mjtIn
 
 
 def start(at: Site) -> dict[str, jax.Array]:
-    """Memory at the start; `fresh`: the first sub-step is rigid and shows where the load leaves the motor."""
-    return {"twist": jnp.zeros(len(at)), "speed": jnp.zeros(len(at)), "fresh": jnp.ones((), bool)}
+    """Memory at the start; `fresh`: the first sub-step is rigid and shows where the load leaves the motor.
+
+    `origin`: by how much the simulated link is ahead of the true one, so that an encoder on the motor shows from the
+    first what was recorded there; only gravity notices. A recording that leads up to the start takes it away.
+    """
+    none = jnp.zeros(len(at))
+    return {"twist": none, "speed": none, "origin": none, "fresh": jnp.ones((), bool)}
 
 
 def split(at: Site, model: "mjx.Model", on: jax.Array, mark: float) -> "mjx.Model":
@@ -43,10 +49,10 @@ def split(at: Site, model: "mjx.Model", on: jax.Array, mark: float) -> "mjx.Mode
     return model.replace(dof_armature=model.dof_armature.at[at.dadr].set(jnp.where(taken, mark * armature, armature)))
 
 
-def follow(at: Site, memory: Any, step: SubStep) -> tuple[jax.Array, jax.Array]:
+def follow(at: Site, memory: Any, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
     """(twist, slip), `[n]`: motor less link, now; the link moved as the whole simulation let it."""
-    slip = jnp.where(memory["fresh"], 0.0, memory["speed"] - step.qvel[at.dadr])
-    return memory["twist"] + step.dt * slip, slip
+    slip = jnp.where(memory["fresh"], 0.0, memory["speed"] - qvel[at.dadr])
+    return memory["twist"] + at.mj_model.opt.timestep * slip, slip
 
 
 def servos(at: Site) -> tuple[np.ndarray, np.ndarray]:
@@ -63,7 +69,8 @@ def feedback(at: Site, memory: Any, step: SubStep, force: jax.Array, on: jax.Arr
     if not len(ids):
         return force
     model = step.model
-    twist, slip = (x[places] for x in follow(at, memory, step))
+    twist, slip = (x[places] for x in follow(at, memory, step.qvel))
+    twist = twist - memory["origin"][places]
     if int(at.mj_model.opt.integrator) == _RK4:  # its link stands where the sub-step begins, the motor at its middle
         twist = twist + 0.5 * step.dt * step.qvel[at.dadr[places]]
     gear, bias = model.actuator_gear[ids, 0], model.actuator_biasprm[ids]
@@ -120,7 +127,7 @@ def sides(at: Site, memory: Any, step: SubStep, on: jax.Array, mark: float) -> S
     motor, link = jnp.where(own, armature, part * felt), jnp.where(own, felt, (1 - part) * felt)
     lost = torque - drag * step.qvel[dof]
     free = step.dt * (step.inverse[dof] * (step.force - at.scatter(lost))).sum(-1)
-    twist, slip = follow(at, memory, step)
+    twist, slip = follow(at, memory, step.qvel)
     slip = jnp.where(on, slip, 0.0)
     return Sides(
         on=on,
@@ -159,15 +166,29 @@ def _gains(at: Site, step: SubStep, on: jax.Array) -> tuple[jax.Array, jax.Array
 
 
 def recorded(
-    at: Site, memory: Any, before: Mapping[str, jax.Array], after: Mapping[str, jax.Array], on: jax.Array
-) -> dict[str, jax.Array]:
-    """Set the links to where they were recorded; the motors in memory are moved along with them.
+    at: Site, memory: Any, before: Measurement, after: Measurement, on: jax.Array, encoder: jax.Array
+) -> tuple[dict[str, jax.Array], Measurement]:
+    """Set what the encoder sees to where it was recorded, and move the other side along with it.
 
-    So a recording gives the motion of both, with its noise, and simulation the one of motors against links.
+    So a recording gives the motion of both, with its noise, and simulation the one of motors against links. An encoder
+    on the motor says nothing of the link's speed: the link keeps its own.
     """
-    along = after["qvel"][at.dadr] - before["qvel"][at.dadr]
-    speed = jnp.where(memory["fresh"] | ~on, memory["speed"], memory["speed"] + along)
-    return {**memory, "speed": speed}
+    dof, known = at.dadr, on & ~memory["fresh"]
+    motors = jnp.where(known, encoder, 0.0)
+    along = after["qvel"][dof] - before["qvel"][dof]
+    speed = memory["speed"] + along + motors * (before["qvel"][dof] - memory["speed"])
+    memory = {**memory, "speed": jnp.where(known, speed, memory["speed"])}
+    qvel = after["qvel"].at[dof].add(-motors * along)
+    twist, _ = follow(at, memory, qvel)
+    qpos = after["qpos"].at[at.qadr].add(-motors * twist)
+    return {**memory, "origin": jnp.where(known, 0.0, memory["origin"])}, {"qpos": qpos, "qvel": qvel}
+
+
+def shown(at: Site, memory: Any, measurement: Measurement, on: jax.Array, encoder: jax.Array) -> Measurement:
+    """Return what encoders show that are on the motors (`encoder` 1), on the links (0) or between."""
+    twist, slip = follow(at, memory, measurement["qvel"])
+    qpos = measurement["qpos"].at[at.qadr].add(jnp.where(on, encoder * twist - memory["origin"], 0.0))
+    return {"qpos": qpos, "qvel": measurement["qvel"].at[at.dadr].add(jnp.where(on, encoder * slip, 0.0))}
 
 
 class Passed(NamedTuple):
@@ -201,11 +222,19 @@ def transmit(
     return Passed(torque, change, (drive - dt * torque - rigid * change) / slow)
 
 
-def finish(at: Site, step: SubStep, both: Sides, passed: Passed, twist: jax.Array) -> tuple[dict, jax.Array]:
-    """(memory, generalised force `[nv]`): the link gets what passed instead of what the actuators exert."""
+def finish(
+    at: Site, memory: Any, step: SubStep, both: Sides, passed: Passed, twist: jax.Array, encoder: jax.Array | None
+) -> tuple[dict, jax.Array]:
+    """(memory, generalised force `[nv]`): the link gets what passed instead of what the actuators exert.
+
+    twist: where the sub-step begins; memory: so far; encoder: see `shown`.
+    """
     own = passed.torque + both.inside * passed.change / step.dt - both.lost
     speed = step.qvel[at.dadr] + passed.change + jnp.where(both.on, passed.slip, 0.0)
-    memory = {"twist": jnp.where(both.on, twist, 0.0), "speed": speed, "fresh": jnp.zeros((), bool)}
+    twist, origin = jnp.where(both.on, twist, 0.0), memory["origin"]
+    if encoder is not None:
+        origin = jnp.where(memory["fresh"], encoder * twist, origin)
+    memory = {"twist": twist, "speed": speed, "origin": origin, "fresh": jnp.zeros((), bool)}
     return memory, at.scatter(jnp.where(both.on, own, 0.0))
 
 
@@ -223,11 +252,23 @@ def inverse(matrix: jax.Array) -> jax.Array:
     return 1.0 / matrix if size == 1 else jax.lax.fori_loop(0, size, step, matrix)
 
 
+# where the encoder sits between the link (0) and the motor (1)
+ENCODER = Quantity("encoder", 0.0, 0.0, 1.0, grid=(0.0, 1.0), shape=True, optional=True)
+
+
 class OfTransmission:
-    """What effects on a transmission share; `mark`: see `split`; the first parameter is above 0 where there is one."""
+    """What effects on a transmission share.
+
+    `mark`: see `split`. The first parameter is above 0 where there is one; the last may be `ENCODER`.
+    """
 
     mark: ClassVar[float]
     follows: ClassVar[bool] = True
+    quantities: ClassVar[tuple[Quantity, ...]]
+
+    def encoder(self, at: Site, theta: jax.Array) -> jax.Array | None:
+        """`[n]`, see `shown`; None: on the link."""
+        return at.values(theta)[:, -1] if self.quantities[-1] is ENCODER else None
 
     def on(self, at: Site, theta: jax.Array) -> jax.Array:
         """`[n]` bool, joints that have one."""
@@ -244,8 +285,19 @@ class OfTransmission:
     ) -> tuple[Any, jax.Array]:
         return memory, feedback(at, memory, step, force, self.on(at, theta))
 
-    def on_record(self, at: Site, memory: Any, before: Any, after: Any, theta: jax.Array) -> Any:
-        return recorded(at, memory, before, after, self.on(at, theta))
+    def on_record(
+        self, at: Site, memory: Any, before: Measurement, after: Measurement, theta: jax.Array
+    ) -> tuple[Any, Measurement]:
+        encoder = self.encoder(at, theta)
+        return recorded(at, memory, before, after, self.on(at, theta), jnp.float32(0.0) if encoder is None else encoder)
+
+    def on_measurement(
+        self, at: Site, memory: Any, measurement: Measurement, theta: jax.Array
+    ) -> tuple[Any, Measurement]:
+        encoder = self.encoder(at, theta)
+        if encoder is None:
+            return memory, measurement
+        return memory, shown(at, memory, measurement, self.on(at, theta), encoder)
 
     def transmits(self, at: Site, theta: jax.Array) -> jax.Array:
         return at.scatter(jnp.where(self.on(at, theta), 1.0, 0.0)) > 0
