@@ -19,11 +19,11 @@ class Backlash(transmission.OfTransmission, Effect):
 
     J w_m' = tau - d w_m - s, link moved by s, |q_m - q| <= gap, s = 0 inside. The motor is that of `joint_elasticity`:
     its inertia J is the joint's armature, or a fifth of what is felt at the joint, d the joint's damping. The sensors
-    show the link, or the motor; position servos see the motor. Teeth do not bounce. At the start the load has pushed the motor to one
-    end of the gap; where a recording leads up to the start, the motor is where this brought it.
+    show the link, or the motor; position servos see the motor. Teeth do not bounce. At the start the load has pushed
+    the motor to one end of the gap; where a recording leads up to the start, it is where this brought it.
 
-    Parameters: `gap`, half of the play, rad (hinge) or m (slide), neutral 0; the optional `encoder` (0 on the link, 1 on
-    the motor), without effect where the gap is 0.
+    Parameters: `gap`, half of the play, rad (hinge) or m (slide), neutral 0; the optional `encoder` (0 on the link, 1
+    on the motor), without effect where the gap is 0.
     """
 
     name: ClassVar[str] = "backlash"

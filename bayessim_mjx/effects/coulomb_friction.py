@@ -37,7 +37,8 @@ class CoulombFriction(Effect):
     witness: ClassVar[tuple[str, str] | None] = ("temperature", "temperature of motor or gearbox (`temperature`)")
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("level", 0.0, 0.0, 1.0, unit="N m", per="force", reach=(0.0, 1.0)),
-        Quantity("relaxation", 0.0, 0.0, 0.04, unit="s", grid=(0.0,), shape=True, optional=True),  # MuJoCo's default is 0.02
+        # up to twice MuJoCo's default
+        Quantity("relaxation", 0.0, 0.0, 0.04, unit="s", grid=(0.0,), shape=True, optional=True),
     )
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:

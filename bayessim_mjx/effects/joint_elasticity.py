@@ -19,8 +19,9 @@ class JointElasticity(transmission.OfTransmission, Effect):
 
     The actuators turn the motor, whose inertia J is the joint's armature (taken off the link), or a fifth of what is
     felt at the joint where the model has none; J_s is the inertia of motor against link. The sensors show the link,
-    or the motor; position servos see the motor. The joint's damping d_j is the motor's; its friction stays with the link. At the
-    start the spring is wound up by the torque that a rigid joint would pass on, or as the recording before it says.
+    or the motor; position servos see the motor. The joint's damping d_j is the motor's; its friction stays with the
+    link. At the start the spring is wound up by the torque that a rigid joint would pass on, or as the recording before
+    it says.
 
     Parameters: `compliance` 1/k, rad/(N m) (hinge) or m/N (slide), neutral 0; `damping` zeta and the optional `encoder`
     (0 on the link, 1 on the motor), without effect where the compliance is 0.

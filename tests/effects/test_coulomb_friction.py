@@ -168,7 +168,8 @@ def softly(xml, joints, levels, seconds, commands, timestep=0.0005):
     spec = mujoco.MjSpec.from_string(xml)
     spec.option.timestep = timestep
     for name, level in zip(joints, levels, strict=True):
-        spec.joint(name).frictionloss, spec.joint(name).solref_friction = level, [seconds, 1.0]
+        joint = spec.joint(name)
+        joint.frictionloss, joint.solref_friction = level, [seconds, 1.0]
     model = spec.compile()
     data, rows = mujoco.MjData(model), []
     for row in commands:
@@ -180,7 +181,7 @@ def softly(xml, joints, levels, seconds, commands, timestep=0.0005):
 
 @pytest.mark.parametrize(("seconds", "within"), [(0.02, 0.12), (0.1, 0.05)])
 def test_relaxes_as_mujocos_soft_friction(seconds, within):
-    """An arm of two joints, under gravity: the change of its motion against rigid friction, to 12 and 5 % of its size."""
+    """An arm of two joints: the change of its motion against rigid friction, to 12 and 5 % of its size."""
     joints, levels = ("shoulder", "elbow"), (6.0, 2.0)
     t = DT * np.arange(100)
     commands = 5 * np.sin(8 * t)[:, None]

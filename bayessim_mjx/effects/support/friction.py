@@ -19,9 +19,7 @@ DMIN, DMAX = 0.9, 0.95  # MuJoCo's default solimp
 _SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
-def resist(
-    at: Site, step: SubStep, level: jax.Array, damping: jax.Array, soft: "Soft | None" = None
-) -> jax.Array:
+def resist(at: Site, step: SubStep, level: jax.Array, damping: jax.Array, soft: "Soft | None" = None) -> jax.Array:
     """Generalised force `[nv]` of friction that opposes the motion and never reverses it.
 
     F = -(level + damping |w|) sgn(w), w at the *end* of the sub-step (implicit: stable for any damping). At rest F is
