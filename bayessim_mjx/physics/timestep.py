@@ -54,7 +54,9 @@ class Timestep:
 
     def view(self, data: mjx.Data, **known: Any) -> SubStep:
         """Return the timestep as effects see it."""
-        return SubStep(self.model, data, self.seen, float(self.physics.mj_model.opt.timestep), **known)
+        time = self.model.opt.timestep  # an argument of the program where errors of the time step are measured
+        dt = time if isinstance(time, jax.core.Tracer) else float(self.physics.mj_model.opt.timestep)
+        return SubStep(self.model, data, self.seen, dt, **known)
 
     @property
     def corrected(self) -> bool:

@@ -6,7 +6,6 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +17,7 @@ from bayessim_mjx.device import on_cores
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES, eliminate
 from bayessim_mjx.diagnosis.fitting.windows import Batch, Windows
 from bayessim_mjx.physics import Drive, Physics, begin, staggered, substep
+from bayessim_mjx.physics.pushed import apart
 from bayessim_mjx.physics.tangent import difference, integrate
 
 Array = NDArray[np.float64]
@@ -110,19 +110,21 @@ class Errors:
         world = world.replace(qpos=integrate(physics.mj_model, world.qpos, offset[:nv]), qvel=world.qvel + offset[nv:])
         model = physics.model_of(world).tree_replace({"opt.timestep": h})
         early = 0.5 * corrected * h if staggered(physics.mj_model) else 0.0
+        thetas = physics.split(world.theta)[1]  # of the model's own forces, which have no parameters
 
-        def step(data: Any, row: tuple) -> tuple[Any, tuple]:
-            command, enabled, extra = row
+        def step(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
+            (data, memory), (command, enabled, extra) = carry, row
             seen = {"qpos": data.qpos, "qvel": data.qvel}
             drive = Drive(extra, enabled, own.law)
 
-            def sub(k: jax.Array, data: Any) -> Any:
-                return substep(physics, model, data.replace(ctrl=command[k]), ((), ()), (), seen, drive)[0]
+            def sub(k: jax.Array, carry: tuple) -> tuple:
+                return substep(physics, model, carry[0].replace(ctrl=command[k]), carry[1], thetas, seen, drive)
 
-            data = jax.lax.fori_loop(0, count, sub, data)
-            return data, (data.qpos, data.qvel + early * data.qacc)
+            data, memory = jax.lax.fori_loop(0, count, sub, (data, memory))
+            return (data, memory), (data.qpos, data.qvel + early * data.qacc)
 
-        _, (qpos, qvel) = jax.lax.scan(step, physics.data_of(world), (own.command, own.enabled, force))
+        start = physics.data_of(world), (world.memory, apart(physics, world.forces))
+        _, (qpos, qvel) = jax.lax.scan(step, start, (own.command, own.enabled, force))
         error = jax.vmap(lambda a, b: difference(physics.mj_model, a, b))(own.qpos, qpos)
         return jnp.concatenate([error, own.qvel - qvel], axis=1)
 

@@ -39,7 +39,7 @@ class SubStep:
         model: "mjx.Model",
         data: "mjx.Data",
         measurement: dict[str, jax.Array],
-        dt: float,
+        dt: float | jax.Array,
         asked: jax.Array | None = None,
         response: "Callable[[], jax.Array | None] | None" = None,
     ) -> None:

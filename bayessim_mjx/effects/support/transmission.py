@@ -200,7 +200,13 @@ class Passed(NamedTuple):
 
 
 def transmit(
-    both: Sides, dt: float, soft: jax.Array, loss: jax.Array, late: jax.Array, rest: jax.Array, held: jax.Array
+    both: Sides,
+    dt: float | jax.Array,
+    soft: jax.Array,
+    loss: jax.Array,
+    late: jax.Array,
+    rest: jax.Array,
+    held: jax.Array,
 ) -> Passed:
     """Solve motors and links together where `held` `[n]`; elsewhere nothing passes between them.
 

@@ -3,6 +3,7 @@
 Logs come from MuJoCo C: by Runge-Kutta at a tenth of the step (the continuous truth), or by the very same step.
 """
 
+import dataclasses
 import itertools
 from types import SimpleNamespace
 
@@ -18,6 +19,7 @@ from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
 from bayessim_mjx.diagnosis.setup import _measured
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
+from bayessim_mjx.physics import native
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
 
@@ -70,9 +72,9 @@ def swing(i, time, qpos, qvel):
     return np.array([40.0, 14.0]) * (target - qpos) - np.array([3.0, 1.0]) * qvel
 
 
-def measured(xml, recorded):
+def measured(own, recorded):
     """(discretisation, rms of measured minus simulated positions by factor, start states fitted)."""
-    physics = the(xml).physics(PERIOD)
+    physics = own.physics(PERIOD)
     cuts = windows_of(physics, recorded, None, False)
     found = discretisation.measure(physics, cuts, recorded, 4)
     errors = Errors(physics, cuts(1), 4)
@@ -91,8 +93,20 @@ def measured(xml, recorded):
     return found, {f: left(f) for f in (1, 2, 4)}
 
 
+RUBS = ARM.replace("<joint", '<joint frictionloss=".4"')
+
+
+@pytest.mark.parametrize("xml", [RUBS, ARM.replace('damping=".06"', 'damping=".06 .3 .2"')])
+def test_finer_steps_have_the_models_own_forces(xml):
+    """Dry friction without the solver, and polynomial damping: without them the motion is another one."""
+    recorded = logs(xml, swing)
+    own = dataclasses.replace(the(xml), rubbing=native.rubbing(the(xml).mj_model))
+    there, gone = (measured(which, recorded)[1][4].max() for which in (own, the(ARM)))
+    assert there < 2.5 * NOISE < 0.2 * gone
+
+
 def test_a_pushed_mass_is_ahead_by_half_a_step():
-    found, _ = measured(MASS, logs(MASS, push))
+    found, _ = measured(the(MASS), logs(MASS, push))
     # x_n = a h^2 n (n + 1) / 2 against a t^2 / 2: ahead by a h t / 2, as if it had started faster
     since = PERIOD * np.arange(1, 51)
     assert found.own[0] == pytest.approx(3.0 / 2.0 * STEP / 2 * np.sqrt(np.mean(since**2)), rel=0.02)
@@ -101,7 +115,7 @@ def test_a_pushed_mass_is_ahead_by_half_a_step():
 
 
 def test_fast_motion_is_simulated_more_finely_until_the_step_does_not_show():
-    found, left = measured(ARM, logs(ARM, swing))
+    found, left = measured(the(ARM), logs(ARM, swing))
     assert found.factor > 1 and not found.simulated.any()
     assert (left[1] / NOISE).max() > 1.3  # would be explained by some effect
     assert (left[found.factor] / found.floor[:2]).max() < 1.2
@@ -122,14 +136,14 @@ def test_fast_motion_is_simulated_more_finely_until_the_step_does_not_show():
 @pytest.mark.slow
 def test_the_integrator_that_is_recommended_leaves_nothing():
     """RK4 at the same step: commands act when they are sent, and velocities are those of the positions' time."""
-    found, left = measured(ARM.replace("implicitfast", "RK4"), logs(ARM, swing))
+    found, left = measured(the(ARM.replace("implicitfast", "RK4")), logs(ARM, swing))
     assert found.factor == 1 and (found.own[:2] / NOISE).max() < 0.1 and not found.warnings()
     assert (left[1] / NOISE).max() < 1.05  # nothing but the sensors' noise
 
 
 @pytest.mark.parametrize("finer", [1, 10])
 def test_without_noise_the_step_itself_is_the_floor(finer):
-    found, left = measured(ARM, logs(ARM, swing, finer, noise=0.0))
+    found, left = measured(the(ARM), logs(ARM, swing, finer, noise=0.0))
     assert found.simulated.all()
     assert (left[min(found.factor, 4)] / found.floor[:2]).max() < 1.2
     assert (left[1] / found.sigma[:2]).max() > 10  # a huge gap, were the floor the sensors' alone
