@@ -12,6 +12,12 @@ from bayessim_mjx.effects.support.quantity import LINK_ENCODER
 from bayessim_mjx.effects.support.site import Site
 from bayessim_mjx.effects.support.substep import SubStep
 
+RATIO = 0.7  # damping of the teeth, of critical: "teeth do not bounce"; not counted
+TEETH = Quantity(
+    "compliance", 0.0, 0.0, 0.01, unit="rad/(N m)", per="1/force", reach=(0.0, 0.03), grid=(0.0,), shape=True,
+    optional=True,
+)  # fmt: skip
+
 
 @dataclasses.dataclass(frozen=True)
 class Backlash(transmission.OfTransmission, Effect):
@@ -22,8 +28,8 @@ class Backlash(transmission.OfTransmission, Effect):
     show the link, or the motor; position servos see the motor. Teeth do not bounce. At the start the load has pushed
     the motor to one end of the gap; where a recording leads up to the start, it is where this brought it.
 
-    Parameters: `gap`, half of the play, rad (hinge) or m (slide), neutral 0; the optional `encoder` (0 on the link, 1
-    on the motor), without effect where the gap is 0.
+    Parameters: `gap`, half of the play, rad (hinge) or m (slide), neutral 0; the optional `compliance` of the teeth,
+    rad/(N m) or m/N, and `encoder` (0 on the link, 1 on the motor), without effect where the gap is 0.
     """
 
     name: ClassVar[str] = "backlash"
@@ -34,6 +40,7 @@ class Backlash(transmission.OfTransmission, Effect):
     witness = LINK_ENCODER
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity("gap", 0.0, 0.0, 0.05, unit="rad", per="travel", reach=(0.0, 0.1), grid=(0.03, 0.1, 0.4)),
+        TEETH,
         transmission.ENCODER,
     )
 
@@ -41,13 +48,20 @@ class Backlash(transmission.OfTransmission, Effect):
         on, gap, fresh = self.on(at, theta), at.values(theta)[:, 0], memory["fresh"]
         both = transmission.sides(at, memory, step, on, self.mark)
         none, whole = jnp.zeros(len(at)), jnp.full(len(at), step.dt)
+        soft = at.values(theta)[:, 1] if TEETH in self.quantities else None
+        teeth = none, none, whole
+        if soft is not None:
+            teeth = transmission.sprung(both, step.dt, jnp.where(fresh, 0.0, soft), RATIO)
 
         def solve(side: jax.Array) -> transmission.Passed:
             rest = jnp.where(fresh, 0.0, gap * side)
-            return transmission.transmit(both, step.dt, none, none, whole, rest, on & (fresh | (side != 0)))
+            return transmission.transmit(both, step.dt, *teeth, rest, on & (fresh | (side != 0)))
 
         twist = both.twist + step.dt * solve(none).slip  # if nothing touched
         side = jnp.where(jnp.abs(twist) > gap, jnp.sign(twist), 0.0)
         passed = solve(jnp.where(solve(side).torque * side > 0, side, 0.0))
-        twist = jnp.where(fresh, gap * jnp.sign(passed.torque), both.twist)
+        wound = gap * jnp.sign(passed.torque)
+        if soft is not None:
+            wound = wound + soft * passed.torque
+        twist = jnp.where(fresh, wound, both.twist)
         return transmission.finish(at, memory, step, both, passed, twist, self.encoder(at, theta))

@@ -47,12 +47,7 @@ class JointElasticity(transmission.OfTransmission, Effect):
         both = transmission.sides(at, memory, step, on, self.mark)
         compliance, ratio, *_ = at.values(theta).T
         soft = jnp.where(on & ~memory["fresh"], compliance, 0.0)
-        period = jnp.where(on, soft * both.series, 0.0)  # J_s / k
-        root = jnp.sqrt(jnp.where(period > 0, period, 1.0))
-        loss = jnp.where(period > 0, 2 * ratio * root, 0.0)  # d / k = 2 zeta sqrt(J_s / k)
-        # a resolved spring is looked at where the sub-step begins, which costs no energy; a stiff one where it ends
-        squares = period / (step.dt**2 * (1 + period * both.kp / both.motor))
-        late = step.dt * jnp.maximum(1.0 - squares, 0.0)
-        passed = transmission.transmit(both, step.dt, soft, loss, late, jnp.zeros(len(at)), on)
+        spring = transmission.sprung(both, step.dt, soft, ratio)
+        passed = transmission.transmit(both, step.dt, *spring, jnp.zeros(len(at)), on)
         twist = jnp.where(memory["fresh"], compliance * passed.torque, both.twist)
         return transmission.finish(at, memory, step, both, passed, twist, self.encoder(at, theta))

@@ -167,6 +167,22 @@ def test_backlash_is_play_between_two_bodies(gap):
         assert np.abs(q - real).max() < 0.2 * np.abs(without - real).max()
 
 
+@pytest.mark.slow
+@pytest.mark.ci
+def test_teeth_may_be_springs():
+    """Play whose ends give way: MuJoCo's limit with an impedance so low that it is a spring and a damper."""
+    gap, compliance, d = 0.02, 1 / 60, 0.03
+    model_ = mujoco.MjModel.from_xml_string(model(TORQUE))
+    own = Physics(model_, 0.02, ParameterSpace(), [make("backlash", "link").with_all()])
+    soft, hard, none = moved(own, np.array([[gap, compliance, 0], [gap, 0, 0], [0, 0, 0]]), PUSHED)[..., 0]
+    # its stiffness is d / (1 - d) times SERIES d k / d^2, its damping d / (1 - d) times SERIES b / d
+    k, b = (1 - d) / SERIES / compliance, (1 - d) / SERIES * 2 * 0.7 * np.sqrt(SERIES / compliance)
+    between = f'limited="true" range="-{gap} {gap}" solreflimit="-{k} -{b}" solimplimit="{d} {d} .001"'
+    real = apart(between, TORQUE, "Euler", PUSHED, gap * np.sign(PUSHED[0, 0]))
+    off = {name: np.abs(q - real).max() for name, q in (("soft", soft), ("hard", hard), ("none", none))}
+    assert off["soft"] < 0.3 * off["hard"] and off["hard"] < off["none"], off
+
+
 def weightless(xml):
     return mujoco.MjModel.from_xml_string(xml.replace("<option ", '<option gravity="0 0 0" '))
 
@@ -185,7 +201,12 @@ def test_an_encoder_on_the_motor_shows_the_motor(actuator, integrator, size):
     gap, command, stiffness = 0.03, size * PUSHED, (2 * np.pi * 5) ** 2 * SERIES
     play = f'limited="true" range="-{gap} {gap}" solreflimit=".001 1"'
     spring = f'stiffness="{stiffness}" damping="{0.2 * np.sqrt(stiffness * SERIES)}"'
-    rows = [[0, 0.1, 0, gap, 1], [1 / stiffness, 0.1, 1, 0, 0], [0, 0.1, 0, gap, 0], [1 / stiffness, 0.1, 0, 0, 0]]
+    rows = [
+        [0, 0.1, 0, gap, 0, 1],
+        [1 / stiffness, 0.1, 1, 0, 0, 0],
+        [0, 0.1, 0, gap, 0, 0],
+        [1 / stiffness, 0.1, 0, 0, 0, 0],
+    ]
     for motor, link, between, start in ((0, 2, play, gap * np.sign(command[0, 0])), (1, 3, spring, 0.0)):
         two = weightless(TWO.format(between=between, actuator=actuator.format("motor")))
         shown = moved(own, np.array(rows), command, qpos=[start])[..., 0]

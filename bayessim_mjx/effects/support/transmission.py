@@ -228,6 +228,20 @@ def transmit(
     return Passed(torque, change, (drive - dt * torque - rigid * change) / slow)
 
 
+def sprung(
+    both: Sides, dt: float | jax.Array, soft: jax.Array, ratio: jax.Array | float
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """(soft, loss, late) for `transmit` of springs of compliance `soft` `[n]`, damped by `ratio` of critical.
+
+    A resolved spring is looked at where the sub-step begins, which costs no energy; a stiff one where it ends.
+    """
+    period = jnp.where(both.on, soft * both.series, 0.0)  # J_s / k
+    root = jnp.sqrt(jnp.where(period > 0, period, 1.0))
+    loss = jnp.where(period > 0, 2 * ratio * root, 0.0)  # d / k = 2 zeta sqrt(J_s / k)
+    squares = period / (dt**2 * (1 + period * both.kp / both.motor))
+    return soft, loss, dt * jnp.maximum(1.0 - squares, 0.0)
+
+
 def finish(
     at: Site, memory: Any, step: SubStep, both: Sides, passed: Passed, twist: jax.Array, encoder: jax.Array | None
 ) -> tuple[dict, jax.Array]:
