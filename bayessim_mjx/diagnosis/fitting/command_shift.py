@@ -1,8 +1,9 @@
 """Do commands act when the log says? The time by which they act later or earlier, beside all that forces can explain.
 
-Windows are simulated at shifted commands, and linearised in the shift, the known parameters, the actuators' gains and
-forces of each joint (constant, with position, with speed, with its direction). What remains for the shift is its own:
-friction or a wrong damping do not become one. No drive acts before its command, so a lead is a fault of the log.
+Windows are simulated at shifted commands, and linearised in the shift, the known parameters, the actuators' gains, kp
+and kv of servos, and forces of each joint (constant, with position, with speed, with its direction). What remains for
+the shift is its own: friction or a wrong damping do not become one. No drive acts before its command, so a lead is a
+fault of the log.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import dataclasses
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,11 +22,18 @@ from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
 from bayessim_mjx.diagnosis.fitting.substep_errors import Case, Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
+from bayessim_mjx.diagnosis.logcheck.drives import dof_of
 from bayessim_mjx.diagnosis.logcheck.timing import SURE
+from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.effects.servo_damping import ServoDamping
+from bayessim_mjx.effects.servo_stiffness import ServoStiffness
 from bayessim_mjx.effects.support.motion import AROUND
+from bayessim_mjx.effects.support.site import element_names
 
 Array = NDArray[np.float64]
 Shifted = Callable[[float], Windows]  # s -> the windows with commands that act so much later
+GAINS = (ServoStiffness, ServoDamping)  # kp and kv
+LOOSE, TIGHT = 1e-6, 1e2  # damping of Levenberg and Marquardt's steps, of a curvature; choices of numerics
 LEAST = 0.05  # control steps: a simulator's own step may be worth as much; a rule of thumb
 
 
@@ -85,6 +94,20 @@ class Shift:
         return f"{text}{smooth} (`commands_late: {self.late:.4g}` beside the logs does the same)"
 
 
+def beside(model: mujoco.MjModel) -> tuple[Effect, ...]:
+    """Return the gains of a model's servos as effects: the least known numbers of a servo, and they move it in time."""
+    names = element_names(model, "actuator")
+    own = {kind: tuple(n for i, n in enumerate(names) if kind.carries(model, i)) for kind in GAINS}
+    return tuple(kind(where=where) for kind, where in own.items() if where)
+
+
+def _servoed(model: mujoco.MjModel, kind: type[Effect]) -> NDArray[np.bool_]:
+    """`[nv]`, whether a servo with this gain drives the joint itself."""
+    out = np.zeros(model.nv, bool)
+    out[[v for i in range(model.nu) if kind.carries(model, i) and (v := dof_of(model, i)) is not None]] = True
+    return out
+
+
 def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -> Shift | None:
     """Return the shift of all commands together; None: there are none, or the fit finds no end.
 
@@ -101,20 +124,23 @@ def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -
     precision = np.full(model.size, WORST**-2)
     x, starts = np.zeros(model.size), np.zeros_like(errors.offsets)
     r = model.residual(x, starts)
-    A = model.columns()
+    A, linear = model.columns(x, starts, r), x  # where the derivatives are those of
     B = errors.columns(sigma)
-    share, gained = 1.0, np.inf
-    while gained > len(cut) and abs(x[0]) < 1:  # a squared noise a window; by derivatives at the beginning
+    damping, gained = LOOSE, np.inf
+    while (gained > len(cut) or damping > LOOSE) and damping < TIGHT and abs(x[0]) < 1:  # a squared noise a window
         q, found = eliminate(r, A, B, errors.offsets + starts, cut.spread)
         g, S = q.weighted(np.ones(len(cut)))
-        change = share * np.asarray(np.linalg.solve(S + np.diag(precision), g - precision * x), np.float64)
-        moved = x + change, starts + share * found.step(A, change / share)
+        held = S + np.diag(precision + damping * np.diag(S))
+        change = np.asarray(np.linalg.solve(held, g - precision * x), np.float64)
+        moved = x + change, starts + found.step(A, change)
         there = model.residual(*moved)
         gained = float(np.sum(r**2) - np.sum(there**2))
         if gained > 0:
-            (x, starts), r = moved, there
-        elif share == 1:
-            share, gained = 0.5, np.inf
+            (x, starts), r, damping = moved, there, max(damping / 6, LOOSE)
+        elif linear is not x:
+            (A, linear), gained = (model.columns(x, starts, r), x), np.inf
+        else:
+            damping, gained = 6 * damping, np.inf
     if abs(x[0]) >= 1:
         return None
     return _judged(eliminate(r, A, B, errors.offsets + starts, cut.spread)[0], x, precision, cut, r.size - starts.size)
@@ -123,7 +149,8 @@ def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -
 class _Model:
     """Whitened residuals `[W, n]` as a function of (shift, parameters, gains, forces), each in units of its scale.
 
-    That of the shift is `AROUND`; of parameters their range, or `WORST` of their value; of gains 1.
+    That of the shift is `AROUND`; of parameters their range, or `WORST` of their value; of servos' own gains (`beside`)
+    their range; of the commands' gains 1.
     """
 
     def __init__(self, errors: Errors, late: Shifted, sigma: Array, force: Array, factor: int) -> None:
@@ -131,15 +158,20 @@ class _Model:
         space = errors.physics.space
         low, high = (np.array([getattr(p, end) for p in space.parameters]) for end in ("low", "high"))
         self.nominal, self.positive = np.asarray(space.nominal, float), low > 0
-        self.span = np.where(self.nominal != 0, np.minimum(high - low, WORST * np.abs(self.nominal)), high - low)
-        self.forces = _shapes(errors.cut) * force  # [4, W, H, nv]
-        self.parts = np.cumsum([1, len(low), errors.physics.mj_model.nu])
-        self.size = int(self.parts[-1]) + 4 * len(force)
+        known = np.array([p.kind != "effect" for p in space.parameters], bool) & (self.nominal != 0)
+        self.span = np.where(known, np.minimum(high - low, WORST * np.abs(self.nominal)), high - low)
+        model = errors.physics.mj_model
+        exact = {kind: _servoed(model, kind) for kind in GAINS}  # the speed's own column would be the same, less exact
+        every = [np.ones(len(force), bool), ~exact[ServoStiffness], ~exact[ServoDamping], np.ones(len(force), bool)]
+        shape, dof = np.nonzero(every)
+        self.forces = (_shapes(errors.cut) * force)[shape, :, :, dof, None] * np.eye(len(force))[dof, None, None]
+        self.parts = np.cumsum([1, len(low), model.nu])
+        self.size = int(self.parts[-1]) + len(dof)
 
-    def columns(self) -> Array:
-        """`[W, n, size]`, minus the derivatives of the residuals."""
-        first, *there = self._residuals([np.zeros(self.size), *STEP * np.eye(self.size)])
-        return np.stack([(first - moved) / STEP for moved in there], -1)
+    def columns(self, x: Array, starts: Array, residual: Array) -> Array:
+        """`[W, n, size]`, minus the derivatives of the residuals `[W, n]` at x and starts."""
+        there = self._residuals(x + STEP * np.eye(self.size), starts)
+        return np.stack([(residual - moved) / STEP for moved in there], -1)
 
     def residual(self, x: Array, starts: Array) -> Array:
         """Simulate; starts: `[W, 2 nv]`, further changes of the start states."""
@@ -158,16 +190,18 @@ class _Model:
         cut = self.late(AROUND * float(shift[0]))
         command = np.asarray(cut.batch.command) * (1 + np.asarray(gains, np.float32))
         cut = dataclasses.replace(cut, batch=cut.batch.replace(command=command))
-        force = np.einsum("fv,fwhv->whv", loads.reshape(4, -1), self.forces)
+        force = np.tensordot(loads, self.forces, 1)
         return Case(cut, starts, theta, force)
 
 
 def _shapes(cut: Windows) -> Array:
     """`[4, W, H, nv]`, of size 1 at most times: constant, with position, with speed, with the direction of motion.
 
-    Of measured motion, smoothed: the velocity of the logs, at the same rows. Directions are as sure as it is.
+    Of measured motion, smoothed: the velocity of the logs. A force holds over a control step: the mean of both ends.
+    That of its end would lead by half a step, and a servo's wrong damping would look like commands that do.
+    Directions are as sure as a velocity is.
     """
-    rows = [slice(int(a) + 1, int(a) + 1 + cut.steps) for a in cut.start]
+    rows = [slice(int(a), int(a) + 1 + cut.steps) for a in cut.start]
     speed = np.stack([cut.logs[log].qvel[own] for log, own in zip(cut.log, rows, strict=True)])
     noise = np.stack([cut.logs[log].sigma_qvel for log in cut.log])[:, None]
     typical = np.maximum(np.sqrt(np.mean(speed**2, (0, 1))), 1e-12)
@@ -175,7 +209,8 @@ def _shapes(cut: Windows) -> Array:
     travel = travel - travel.mean(1, keepdims=True)
     reach = np.maximum(np.abs(travel).max((0, 1)), 1e-12)
     direction = np.tanh(speed / np.maximum(noise, 1e-12))
-    return np.stack([np.ones_like(speed), travel / reach, speed / typical, direction])
+    ends = np.stack([np.ones_like(speed), travel / reach, speed / typical, direction])
+    return np.asarray(0.5 * (ends[:, :, :-1] + ends[:, :, 1:]))
 
 
 def _judged(q: Quadratic, x: Array, precision: Array, cut: Windows, count: int) -> Shift:

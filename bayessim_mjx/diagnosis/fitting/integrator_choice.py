@@ -23,6 +23,7 @@ from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
 from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, simulated
 from bayessim_mjx.diagnosis.fitting.observation import Stepper
 from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts
+from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.logs.log import Channels, Log
 
 Array = NDArray[np.float64]
@@ -117,25 +118,33 @@ class Choice:
         return self.worth.warnings() if self.stable.factor == 1 else []
 
 
-def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, left: float = np.inf) -> Choice:
+def choose(
+    robot: Robot,
+    dt: float,
+    logs: Sequence[Log],
+    measured: Measured,
+    left: float = np.inf,
+    beside: Sequence[Effect] = (),
+) -> Choice:
     """Return the coarsest stable step; by RK4 where nothing can touch, the logs have noise and there is time.
 
     Logs of a simulation may have been made by the model's own integrator.
 
     Args:
         left: s that one simulation of all windows may take, for the search to end in time.
+        beside: effects that are simulated with the windows, at neutral values here.
     """
     own = robot.physics(dt)
     precise = not contacts(own) and not simulated(own.mj_model, logs).all()
     stable = coarsest_stable(own.mj_model, logs, precise)
     better = stable.robot(robot)
-    cuts, worth = measured(better.physics(dt), first=stable.factor)
+    cuts, worth = measured(better.physics(dt, beside), first=stable.factor)
     if not stable.changed or stable.integrator != RK4:
         return Choice(better, stable, cuts, worth)
     if worth.errors and worth.errors.seconds >= left:
         stable = coarsest_stable(own.mj_model, logs)
         robot = stable.robot(robot)
-        return Choice(robot, stable, *measured(robot.physics(dt), first=stable.factor), better=(TOO_LONG,))
+        return Choice(robot, stable, *measured(robot.physics(dt, beside), first=stable.factor), better=(TOO_LONG,))
     step = 1e3 * worth.timestep / worth.factor
     text = f"the diagnosis simulates by RK4 at {step:.3g} ms: errors of the model's integrator could pass for effects"
     return Choice(better, stable, cuts, worth, better=(text,))
