@@ -25,7 +25,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.odometry import base
 from bayessim_mjx.physics import controllers
-from bayessim_mjx.physics.loops import Loops
+from bayessim_mjx.physics.loops import Loops, yielding
 
 Array = NDArray[np.float64]
 # rad or m, rad/s or m/s, of finite differences in doubles: the cube root of their precision balances the rounding of
@@ -110,13 +110,19 @@ def _with(log: Log, way: Way, model: mujoco.MjModel) -> Log:
 
 
 def _smoothed(log: Log, model: mujoco.MjModel) -> Way:
-    """Return the best of some sizes of what the model lacks; where constraints tell the motion, no model is needed."""
+    """Return the best of some sizes of what the model lacks; where constraints tell the motion, none is needed.
+
+    How exactly they tell it is a matter of the loads on them, as the model has them: MuJoCo's constraints are soft.
+    """
     noise, prior = np.concatenate([log.sigma_dofs, log.sigma_qvel]), np.repeat(PRIOR, model.nv)
-    if (bound := Loops(model).followed(log.qpos, log.qvel, noise, log.seen_dofs)) is not None:
-        known = (prior / np.maximum(bound[2].max(0), NUDGE)) ** 2 - 1
-        if (known > 1).all():
-            return Way(*bound, known)
     stepper = Stepper(model, log)
+    if (bound := stepper.loops.followed(log.qpos, log.qvel, noise, log.seen_dofs)) is not None:
+        qpos, qvel, sd = bound
+        yields = [stepper.opened(q, v, row) for row, (q, v) in enumerate(zip(qpos, qvel, strict=True))]
+        sd = np.hypot(sd, yields)
+        known = (prior / np.maximum(sd.max(0), NUDGE)) ** 2 - 1
+        if (known > 1).all():
+            return Way(qpos, qvel, sd, known)
     measured = _Measured.of(log)
     lacking = _accelerations(model, log)
     tried = [_Filter(stepper, log, measured, share * lacking) for share in SIZES]
@@ -318,7 +324,7 @@ class Stepper:
     def bound(self, qpos: Array, qvel: Array, measured: _Measured) -> tuple[Array, Array, Array]:
         """Equality constraints at a state: (rows `[2 m, 2 nv]` of their derivatives, how far they are off, sd).
 
-        A constraint holds as exactly as the encoders' noise moves it.
+        A constraint holds as exactly as the encoders' noise moves it and as it yields to its load in a step before.
         """
         nv = self.nv
         J, off = self.loops.at(qpos)
@@ -327,8 +333,16 @@ class Stepper:
         noise = np.zeros(2 * nv)
         noise[measured.rows] = measured.sigma
         sd = np.maximum(np.concatenate([np.linalg.norm(J * n, axis=1) for n in (noise[:nv], noise[nv:])]), NUDGE)
+        yields = np.concatenate(yielding(self.data))
+        sd = np.hypot(sd, yields) if len(yields) == len(sd) else sd
         none = np.zeros_like(J)
         return np.block([[J, none], [none, J]]), np.concatenate([off, J @ qvel]), sd
+
+    def opened(self, qpos: Array, qvel: Array, row: int) -> Array:
+        """`[2 nv]`, how far joints that were not seen are from where closed constraints have them, for their loads."""
+        self._at(qpos, qvel, row)
+        mujoco.mj_forward(self.model, self.data)
+        return np.concatenate([self.loops.opened(qpos, by, self.log.seen_dofs) for by in yielding(self.data)])
 
     def linearised(self, qpos: Array, qvel: Array, row: int, span: float | None = None) -> tuple[Array, Array, Array]:
         """`advanced`, and its derivatives by the state `[2 nv, 2 nv]`."""
