@@ -203,8 +203,7 @@ def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | No
     usable, dt = checked.gate.usable, checked.dt
     measured = functools.partial(_measured, usable=usable, group=group, use_qvel=checked.gate.use_qvel, limit=limit)
     left = (budget.seconds - budget.spent) / CUTTING.simulations  # s for one simulation of all windows
-    gains = command_shift.beside(checked.robot.mj_model)
-    steps = integrator_choice.choose(checked.robot, dt, usable, measured, left, gains)
+    steps = integrator_choice.choose(checked.robot, dt, usable, measured, left)
     cuts, step = steps.cuts, steps.worth
     shift = command_shift.estimate(step, cuts, size.force)
     clocked = checked.gate if shift is None else checked.gate.moved(shift.lead)

@@ -99,12 +99,6 @@ class Loops:
                     out[other] = lead
         return out
 
-    def opened(self, qpos: Array, by: Array, seen: NDArray[np.bool_]) -> Array:
-        """`[nv]`, how far the joints that are not seen are off where constraints are open by `[m]`, at a position."""
-        out = np.zeros(self.model.nv)
-        out[~seen] = np.abs(np.linalg.pinv(self.at(qpos)[0][:, ~seen])) @ by
-        return out
-
     def _near(self, qpos: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array] | None:
         """Return `closed` by Newton's method, and derivatives `[nv, nv]` of others by the seen; None where it fails."""
         step, last = np.full(1, np.inf), np.inf

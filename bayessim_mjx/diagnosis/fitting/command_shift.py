@@ -9,31 +9,26 @@ fault of the log.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.data_sheet import WORST
 from bayessim_mjx.diagnosis.fitting.candidates import STEP
 from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation
+from bayessim_mjx.diagnosis.fitting.integrator_choice import GAINS
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
 from bayessim_mjx.diagnosis.fitting.substep_errors import Case, Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck.drives import dof_of
 from bayessim_mjx.diagnosis.logcheck.timing import SURE
-from bayessim_mjx.effects.effect import Effect
-from bayessim_mjx.effects.servo_damping import ServoDamping
-from bayessim_mjx.effects.servo_stiffness import ServoStiffness
 from bayessim_mjx.effects.support.motion import AROUND
-from bayessim_mjx.effects.support.site import element_names
 
 Array = NDArray[np.float64]
 Shifted = Callable[[float], Windows]  # s -> the windows with commands that act so much later
-GAINS = (ServoStiffness, ServoDamping)  # kp and kv
-LOOSE, TIGHT = 1e-6, 1e2  # damping of Levenberg and Marquardt's steps, of a curvature; choices of numerics
 LEAST = 0.05  # control steps: a simulator's own step may be worth as much; a rule of thumb
 
 
@@ -94,20 +89,6 @@ class Shift:
         return f"{text}{smooth} (`commands_late: {self.late:.4g}` beside the logs does the same)"
 
 
-def beside(model: mujoco.MjModel) -> tuple[Effect, ...]:
-    """Return the gains of a model's servos as effects: the least known numbers of a servo, and they move it in time."""
-    names = element_names(model, "actuator")
-    own = {kind: tuple(n for i, n in enumerate(names) if kind.carries(model, i)) for kind in GAINS}
-    return tuple(kind(where=where) for kind, where in own.items() if where)
-
-
-def _servoed(model: mujoco.MjModel, kind: type[Effect]) -> NDArray[np.bool_]:
-    """`[nv]`, whether a servo with this gain drives the joint itself."""
-    out = np.zeros(model.nv, bool)
-    out[[v for i in range(model.nu) if kind.carries(model, i) and (v := dof_of(model, i)) is not None]] = True
-    return out
-
-
 def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -> Shift | None:
     """Return the shift of all commands together; None: there are none, or the fit finds no end.
 
@@ -126,8 +107,13 @@ def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -
     r = model.residual(x, starts)
     A, linear = model.columns(x, starts, r), x  # where the derivatives are those of
     B = errors.columns(sigma)
-    damping, gained = LOOSE, np.inf
-    while (gained > len(cut) or damping > LOOSE) and damping < TIGHT and abs(x[0]) < 1:  # a squared noise a window
+    least, gained, change = (
+        1e-6,
+        np.inf,
+        np.full(model.size, np.inf),
+    )  # damping, of a curvature; by Levenberg, Marquardt
+    damping = least
+    while (gained > len(cut) or damping > least) and abs(x[0]) < 1 and np.abs(change).max() > STEP:
         q, found = eliminate(r, A, B, errors.offsets + starts, cut.spread)
         g, S = q.weighted(np.ones(len(cut)))
         held = S + np.diag(precision + damping * np.diag(S))
@@ -136,7 +122,7 @@ def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -
         there = model.residual(*moved)
         gained = float(np.sum(r**2) - np.sum(there**2))
         if gained > 0:
-            (x, starts), r, damping = moved, there, max(damping / 6, LOOSE)
+            (x, starts), r, damping = moved, there, max(damping / 6, least)
         elif linear is not x:
             (A, linear), gained = (model.columns(x, starts, r), x), np.inf
         else:
@@ -149,7 +135,7 @@ def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -
 class _Model:
     """Whitened residuals `[W, n]` as a function of (shift, parameters, gains, forces), each in units of its scale.
 
-    That of the shift is `AROUND`; of parameters their range, or `WORST` of their value; of servos' own gains (`beside`)
+    That of the shift is `AROUND`; of parameters their range, or `WORST` of their value; of servos' own gains (`GAINS`)
     their range; of the commands' gains 1.
     """
 
@@ -161,9 +147,11 @@ class _Model:
         known = np.array([p.kind != "effect" for p in space.parameters], bool) & (self.nominal != 0)
         self.span = np.where(known, np.minimum(high - low, WORST * np.abs(self.nominal)), high - low)
         model = errors.physics.mj_model
-        exact = {kind: _servoed(model, kind) for kind in GAINS}  # the speed's own column would be the same, less exact
-        every = [np.ones(len(force), bool), ~exact[ServoStiffness], ~exact[ServoDamping], np.ones(len(force), bool)]
-        shape, dof = np.nonzero(every)
+        acts = np.ones((4, model.nv), bool)  # but where kp and kv do the same (position, speed), more exactly
+        for i, (row, kind) in itertools.product(range(model.nu), enumerate(GAINS, 1)):
+            if kind.carries(model, i) and (v := dof_of(model, i)) is not None:
+                acts[row, v] = False
+        shape, dof = np.nonzero(acts)
         self.forces = (_shapes(errors.cut) * force)[shape, :, :, dof, None] * np.eye(len(force))[dof, None, None]
         self.parts = np.cumsum([1, len(low), model.nu])
         self.size = int(self.parts[-1]) + len(dof)

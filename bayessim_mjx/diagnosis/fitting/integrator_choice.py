@@ -24,10 +24,14 @@ from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, simula
 from bayessim_mjx.diagnosis.fitting.observation import Stepper
 from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts
 from bayessim_mjx.effects.effect import Effect
+from bayessim_mjx.effects.servo_damping import ServoDamping
+from bayessim_mjx.effects.servo_stiffness import ServoStiffness
+from bayessim_mjx.effects.support.site import element_names
 from bayessim_mjx.logs.log import Channels, Log
 
 Array = NDArray[np.float64]
 # (robot's physics, first=coarsest stable factor) -> (the windows, the error of the time step)
+GAINS = (ServoStiffness, ServoDamping)  # kp and kv
 Measured = Callable[..., tuple[Any, Discretisation]]
 TOO_LONG = "the model's time step shows beside the noise, and in the time given nothing finer can be searched with"
 RK4, IMPLICITFAST = int(mujoco.mjtIntegrator.mjINT_RK4), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
@@ -118,33 +122,32 @@ class Choice:
         return self.worth.warnings() if self.stable.factor == 1 else []
 
 
-def choose(
-    robot: Robot,
-    dt: float,
-    logs: Sequence[Log],
-    measured: Measured,
-    left: float = np.inf,
-    beside: Sequence[Effect] = (),
-) -> Choice:
+def beside(model: mujoco.MjModel) -> tuple[Effect, ...]:
+    """Return the gains of a model's servos as effects: the least known numbers of a servo, and they move it in time."""
+    names = element_names(model, "actuator")
+    own = {kind: tuple(n for i, n in enumerate(names) if kind.carries(model, i)) for kind in GAINS}
+    return tuple(kind(where=where) for kind, where in own.items() if where)
+
+
+def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, left: float = np.inf) -> Choice:
     """Return the coarsest stable step; by RK4 where nothing can touch, the logs have noise and there is time.
 
     Logs of a simulation may have been made by the model's own integrator.
 
     Args:
         left: s that one simulation of all windows may take, for the search to end in time.
-        beside: effects that are simulated with the windows, at neutral values here.
     """
-    own = robot.physics(dt)
+    own, gains = robot.physics(dt), beside(robot.mj_model)
     precise = not contacts(own) and not simulated(own.mj_model, logs).all()
     stable = coarsest_stable(own.mj_model, logs, precise)
     better = stable.robot(robot)
-    cuts, worth = measured(better.physics(dt, beside), first=stable.factor)
+    cuts, worth = measured(better.physics(dt, gains), first=stable.factor)
     if not stable.changed or stable.integrator != RK4:
         return Choice(better, stable, cuts, worth)
     if worth.errors and worth.errors.seconds >= left:
         stable = coarsest_stable(own.mj_model, logs)
         robot = stable.robot(robot)
-        return Choice(robot, stable, *measured(robot.physics(dt, beside), first=stable.factor), better=(TOO_LONG,))
+        return Choice(robot, stable, *measured(robot.physics(dt, gains), first=stable.factor), better=(TOO_LONG,))
     step = 1e3 * worth.timestep / worth.factor
     text = f"the diagnosis simulates by RK4 at {step:.3g} ms: errors of the model's integrator could pass for effects"
     return Choice(better, stable, cuts, worth, better=(text,))

@@ -342,7 +342,9 @@ class Stepper:
         """`[2 nv]`, how far joints that were not seen are from where closed constraints have them, for their loads."""
         self._at(qpos, qvel, row)
         mujoco.mj_forward(self.model, self.data)
-        return np.concatenate([self.loops.opened(qpos, by, self.log.seen_dofs) for by in yielding(self.data)])
+        hidden, out = ~self.log.seen_dofs, np.zeros((2, self.nv))
+        out[:, hidden] = np.array(yielding(self.data)) @ np.abs(np.linalg.pinv(self.loops.at(qpos)[0][:, hidden])).T
+        return out.ravel()
 
     def linearised(self, qpos: Array, qvel: Array, row: int, span: float | None = None) -> tuple[Array, Array, Array]:
         """`advanced`, and its derivatives by the state `[2 nv, 2 nv]`."""

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting import scales
-from bayessim_mjx.diagnosis.fitting.command_shift import Shift, beside, estimate
+from bayessim_mjx.diagnosis.fitting.command_shift import Shift, estimate
+from bayessim_mjx.diagnosis.fitting.integrator_choice import beside
 from bayessim_mjx.diagnosis.fitting.robot import of_file
 from bayessim_mjx.diagnosis.run import diagnose
 from bayessim_mjx.diagnosis.setup import _measured
