@@ -99,6 +99,15 @@ class Loops:
                     out[other] = lead
         return out
 
+    def opened(self, qpos: Array, seen: NDArray[np.bool_], loaded: mujoco.MjData) -> Array:
+        """`[2 nv]`, how far the joints that are not seen are from where closed constraints have them, for their loads.
+
+        loaded: in that state, after `mj_forward`.
+        """
+        out = np.zeros((2, self.model.nv))
+        out[:, ~seen] = np.array(yielding(loaded)) @ np.abs(np.linalg.pinv(self.at(qpos)[0][:, ~seen])).T
+        return out.ravel()
+
     def _near(self, qpos: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array] | None:
         """Return `closed` by Newton's method, and derivatives `[nv, nv]` of others by the seen; None where it fails."""
         step, last = np.full(1, np.inf), np.inf

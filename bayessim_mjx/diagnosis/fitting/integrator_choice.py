@@ -23,7 +23,6 @@ from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
 from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, simulated
 from bayessim_mjx.diagnosis.fitting.observation import Stepper
 from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts
-from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.servo_damping import ServoDamping
 from bayessim_mjx.effects.servo_stiffness import ServoStiffness
 from bayessim_mjx.effects.support.site import element_names
@@ -31,7 +30,7 @@ from bayessim_mjx.logs.log import Channels, Log
 
 Array = NDArray[np.float64]
 # (robot's physics, first=coarsest stable factor) -> (the windows, the error of the time step)
-GAINS = (ServoStiffness, ServoDamping)  # kp and kv
+GAINS = (ServoStiffness, ServoDamping)  # kp and kv: a servo's least known numbers, which move it in time
 Measured = Callable[..., tuple[Any, Discretisation]]
 TOO_LONG = "the model's time step shows beside the noise, and in the time given nothing finer can be searched with"
 RK4, IMPLICITFAST = int(mujoco.mjtIntegrator.mjINT_RK4), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
@@ -122,13 +121,6 @@ class Choice:
         return self.worth.warnings() if self.stable.factor == 1 else []
 
 
-def beside(model: mujoco.MjModel) -> tuple[Effect, ...]:
-    """Return the gains of a model's servos as effects: the least known numbers of a servo, and they move it in time."""
-    names = element_names(model, "actuator")
-    own = {kind: tuple(n for i, n in enumerate(names) if kind.carries(model, i)) for kind in GAINS}
-    return tuple(kind(where=where) for kind, where in own.items() if where)
-
-
 def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, left: float = np.inf) -> Choice:
     """Return the coarsest stable step; by RK4 where nothing can touch, the logs have noise and there is time.
 
@@ -137,7 +129,9 @@ def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, lef
     Args:
         left: s that one simulation of all windows may take, for the search to end in time.
     """
-    own, gains = robot.physics(dt), beside(robot.mj_model)
+    own, names = robot.physics(dt), element_names(robot.mj_model, "actuator")
+    carried = {k: tuple(n for i, n in enumerate(names) if k.carries(robot.mj_model, i)) for k in GAINS}
+    gains = [kind(where=where) for kind, where in carried.items() if where]  # what `command_shift` has beside its shift
     precise = not contacts(own) and not simulated(own.mj_model, logs).all()
     stable = coarsest_stable(own.mj_model, logs, precise)
     better = stable.robot(robot)

@@ -118,8 +118,10 @@ def _smoothed(log: Log, model: mujoco.MjModel) -> Way:
     stepper = Stepper(model, log)
     if (bound := stepper.loops.followed(log.qpos, log.qvel, noise, log.seen_dofs)) is not None:
         qpos, qvel, sd = bound
-        yields = [stepper.opened(q, v, row) for row, (q, v) in enumerate(zip(qpos, qvel, strict=True))]
-        sd = np.hypot(sd, yields)
+        for row, (q, v) in enumerate(zip(qpos, qvel, strict=True)):
+            stepper.placed(q, v, row)
+            mujoco.mj_forward(stepper.model, stepper.data)
+            sd[row] = np.hypot(sd[row], stepper.loops.opened(q, log.seen_dofs, stepper.data))
         known = (prior / np.maximum(sd.max(0), NUDGE)) ** 2 - 1
         if (known > 1).all():
             return Way(qpos, qvel, sd, known)
@@ -305,14 +307,14 @@ class Stepper:
         span = float(self.log.time[row + 1] - self.log.time[row]) if span is None else span
         steps = max(1, int(np.ceil(span / self.longest - 1e-6)))
         self.model.opt.timestep = span / steps
-        command = self._at(qpos, qvel, row)
+        command = self.placed(qpos, qvel, row)
         for _ in range(steps):
             if self.loop is not None:
                 self.data.ctrl[:] = self.loop(command, self.data.qpos, self.data.qvel)
             mujoco.mj_step(self.model, self.data)
         return self.data.qpos.copy(), self.data.qvel.copy()
 
-    def _at(self, qpos: Array, qvel: Array, row: int) -> Array:
+    def placed(self, qpos: Array, qvel: Array, row: int) -> Array:
         """Return the command of a row; data in that state."""
         data, command = self.data, self.log.ctrl[row]
         if self.log.linear:
@@ -338,14 +340,6 @@ class Stepper:
         none = np.zeros_like(J)
         return np.block([[J, none], [none, J]]), np.concatenate([off, J @ qvel]), sd
 
-    def opened(self, qpos: Array, qvel: Array, row: int) -> Array:
-        """`[2 nv]`, how far joints that were not seen are from where closed constraints have them, for their loads."""
-        self._at(qpos, qvel, row)
-        mujoco.mj_forward(self.model, self.data)
-        hidden, out = ~self.log.seen_dofs, np.zeros((2, self.nv))
-        out[:, hidden] = np.array(yielding(self.data)) @ np.abs(np.linalg.pinv(self.loops.at(qpos)[0][:, hidden])).T
-        return out.ravel()
-
     def linearised(self, qpos: Array, qvel: Array, row: int, span: float | None = None) -> tuple[Array, Array, Array]:
         """`advanced`, and its derivatives by the state `[2 nv, 2 nv]`."""
         before = self.data.act.copy()
@@ -362,7 +356,7 @@ class Stepper:
         """Return derivatives of the accelerations by the state `[nv, 2 nv]`."""
 
         def at(nudge: Array) -> Array:
-            self._at(*self.moved(qpos, qvel, nudge), row)
+            self.placed(*self.moved(qpos, qvel, nudge), row)
             mujoco.mj_forward(self.model, self.data)
             return np.array(self.data.qacc)
 
