@@ -52,15 +52,15 @@ class Shift:
     @property
     def certain(self) -> bool:
         """Whether it explains more than all else that is missing does, in all conditions alike."""
-        return self._shows(abs(self.late), self.error + self.apart) and self.explains > 1 - self.explains
+        return self._shows(abs(self.late), self.error + self.apart)
 
     @property
     def likely(self) -> bool:
-        """Whether there is a lead, but beside a gap that something else has to explain."""
+        """Whether there is a lead that explains as much, but by conditions' own shifts beside something else."""
         return self._shows(-self.late, self.error) and not self.certain
 
     def _shows(self, size: float, error: float) -> bool:
-        return size > max(SURE * error, LEAST * self.step)
+        return size > max(SURE * error, LEAST * self.step) and self.explains > 1 - self.explains
 
     @property
     def lead(self) -> float:

@@ -129,6 +129,8 @@ def test_a_shift_is_told_only_if_nothing_else_would_do_as_well():
     assert not Shift(0.0009, **SURE).certain  # less than a twentieth of a step: a simulator's own
     for worse in ({"error": 1e-3}, {"apart": 1e-3}, {"explains": 0.45}):
         assert not Shift(-0.003, **{**SURE, **worse}).certain
+    assert Shift(-0.003, **{**SURE, "apart": 1e-3}).likely
+    assert not Shift(-0.003, **{**SURE, "explains": 0.14}).likely  # an unknown payload's gap is no hint of a lead
 
 
 def test_the_sentence_names_size_sign_and_remedy():
