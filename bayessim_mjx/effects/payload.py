@@ -1,7 +1,7 @@
 """Payload: a mass that the model does not know (a tool, a gripper's load, a battery, cables) sits on a body."""
 
 import dataclasses
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.effects.support.bodies import inertial_site, native, with_inertials
+from bayessim_mjx.effects.support.bodies import inertial_site, native, uncompensated, with_inertials
 from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.parameters import editing, geometry
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 SWEEPS = 4  # of Jacobi's method: it converges quadratically, 3 are enough for float32
 PAIRS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # plane of the rotation and its axis
+POINT = 1e-9  # m^2, inertia over mass of a point in MuJoCo, which has none without
 FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
 
 
@@ -69,6 +71,8 @@ def _loaded(
 class Payload(Effect):
     """A point mass fixed to a body: mass, centre of mass, inertia and all that MuJoCo derives from them.
 
+    What carries the robot's own weight (`gravcomp`) does not carry it.
+
     Parameters: `mass`, kg, neutral 0; `com_x`, `com_y`, `com_z`, m, where it sits in the body's frame, from the body's
     own centre of mass; without effect where mass = 0.
     """
@@ -101,23 +105,37 @@ class Payload(Effect):
         new = jax.vmap(_loaded)(mass, inertia, ipos, iquat, load, arm)
         return with_inertials(model, at.ids, dict(zip(FIELDS, new, strict=True)))
 
+    def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
+        if not at.mj_model.ngravcomp:
+            return memory, jnp.zeros(at.nv)
+        load, arm = at.values(theta)[:, 0], at.values(theta)[:, 1:]
+        place = (1 - load / step.model.body_mass[at.ids])[:, None] * arm  # the centre of mass has moved towards it
+        return memory, uncompensated(at, step, load, place)
+
     def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
-        """Native: the inertial of link and load together, as `on_model` has it."""
-        for body, i, own in list(native(spec, values)):
+        """Native: the inertial of link and load together, as `on_model` has it; a body of its own beside `gravcomp`."""
+        for body, i, own in reversed(list(native(spec, values))):  # a body that is added has a number after its host's
             if own["mass"] == 0:
                 continue
             model = spec.copy().compile()
+            if model.body_gravcomp[i]:
+                at = model.body_ipos[i] + [own["com_x"], own["com_y"], own["com_z"]]
+                load = body.add_body(
+                    pos=at, ipos=np.zeros(3), mass=own["mass"], inertia=np.full(3, POINT * own["mass"])
+                )
+                load.explicitinertial = True
+                continue
             editing.explicit(spec, body)
-            mass, place, load = model.body_mass[i], model.body_ipos[i], own["mass"]
+            mass, place, more = model.body_mass[i], model.body_ipos[i], own["mass"]
             arm, frame = np.array([own["com_x"], own["com_y"], own["com_z"]]), np.zeros(9)
             mujoco.mju_quat2Mat(frame, model.body_iquat[i])
             turn = frame.reshape(3, 3)
             # I + mu (|r|^2 1 - r r^T), mu = m load / (m + load), in the frame of the body
-            spread = mass * load / (mass + load) * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+            spread = mass * more / (mass + more) * (arm @ arm * np.eye(3) - np.outer(arm, arm))
             moments, axes = np.linalg.eigh(turn @ np.diag(model.body_inertia[i]) @ turn.T + spread)
             axes[:, 0] *= np.linalg.det(axes)  # a rotation, not a reflection
             quat = np.zeros(4)
             mujoco.mju_mat2Quat(quat, axes.ravel())
-            body.mass, body.ipos = mass + load, place + load / (mass + load) * arm
+            body.mass, body.ipos = mass + more, place + more / (mass + more) * arm
             body.inertia, body.iquat, body.ialt.type = moments, quat, mujoco.mjtOrientation.mjORIENTATION_QUAT
         return None

@@ -146,12 +146,15 @@ class Log:
 
     @property
     def sigma_dofs(self) -> Array:
-        """[nv]: noise of the positions per degree of freedom; of an orientation, twice that of its quaternion, rad."""
+        """[nv]: noise of the positions per degree of freedom; of an orientation about each axis, rad.
+
+        A turn by w moves a quaternion by |w| / 2, so three equal variances of turns are four times the sum of its four.
+        """
         out: list[float] = []
         for joint, kind in zip(self.joints, self.channels.kinds, strict=True):
             own = self.sigma_qpos[self.channels.columns(joint)]
             moved = own[: {"free": 3, "ball": 0}.get(kind, 1)]
-            turned = [2.0 * float(np.sqrt(np.mean(own[-4:] ** 2)))] * 3 if kind in ("free", "ball") else []
+            turned = [2.0 * float(np.sqrt(np.sum(own[-4:] ** 2) / 3))] * 3 if kind in ("free", "ball") else []
             out += [*map(float, moved), *turned]
         return np.array(out)
 

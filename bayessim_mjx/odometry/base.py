@@ -234,7 +234,8 @@ def completed(log: Log, model: mujoco.MjModel) -> tuple[Log, Base | None]:
     pose, spread = stand.settled(base.qpos, base.covariance, base.points, deep)
     sd = np.sqrt(np.median(np.diagonal(spread, axis1=1, axis2=2), axis=0))
     tilt = float(np.sqrt(np.mean(sd[3:5] ** 2)))  # the heading's is that of the tilt: nothing depends on either
-    sigma = np.concatenate([np.full(3, sd[2]), np.full(4, tilt / 2)])  # `Log.sigma_dofs`; so does nothing on x and y
+    # as `Log.sigma_dofs` reads it; nothing depends on x and y either
+    sigma = np.concatenate([np.full(3, sd[2]), np.full(4, tilt * np.sqrt(3) / 4)])
     speed = np.sqrt(np.median(base.sd_qvel**2, axis=0))
     speed[3:] = np.hypot(base.noise, speed[3:])
     return _with(log, name, (pose, sigma), (base.qvel, speed), rates=True), base

@@ -23,6 +23,9 @@ _ALLOWED = {
     "scale": "a finite number, not 0",
 }
 KEYS = ("law", "kp", "kd", "limit", "scale", "note")  # note: for people
+NO_INTEGRAL = (
+    "allowed: 0 (no integral term is simulated), or what the loop puts out in the columns `ctrl:` with law: direct"
+)
 
 
 class Law(struct.PyTreeNode):
@@ -123,8 +126,10 @@ def _of_actuator(given: Mapping[str, Any], name: str, actuators: Sequence[str], 
         if key not in actuators:
             raise UserError(f"{source}: controller.{key}: no such actuator; {suggest(str(key), actuators)}")
     own = {**{k: v for k, v in given.items() if k not in blocks}, **blocks.get(name, {})}
+    if own.get("ki") not in (None, 0):
+        raise UserError(f"{source}: controller.ki = {own['ki']!r}; {NO_INTEGRAL}")
     for key in own:
-        if key not in KEYS:
+        if key not in (*KEYS, "ki"):
             raise UserError(f"{source}: controller.{key}: {suggest(str(key), [*KEYS, *actuators])}")
     law = str(own.get("law", "direct")).lower()
     if law not in ALIASES:

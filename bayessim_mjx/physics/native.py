@@ -1,4 +1,4 @@
-"""Forces of MuJoCo that MJX leaves out, or is slow at: they are added, moved to joints or refused."""
+"""What MuJoCo has and MJX leaves out, or is slow at: it is added, moved to joints or refused."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -29,6 +29,27 @@ _ABSENT = {
     "tendon_dampingpoly": ("a tendon's polynomial damping", "write one number as its damping"),
     "tendon_stiffnesspoly": ("a tendon's polynomial stiffness", "write one number as its stiffness"),
     "actuator_dampingpoly": ("an actuator's polynomial damping", "write it at its joint"),
+}
+# (field of the model, name in mujoco of its value): (what it is, what to write in its place)
+_DRIVES = {
+    ("actuator_gaintype", "mjtGain.mjGAIN_DCMOTOR"): (
+        "dcmotor",
+        'write <general gainprm="K/R" biastype="affine" biasprm="0 0 -K*K/R"/>, K its motorconst and R its resistance; '
+        "a diagnosis searches for lag and cogging",
+    ),
+    ("actuator_gaintype", "mjtGain.mjGAIN_PID"): (
+        "pid",
+        "write <position kp= kv=/>; an integral term and a target of the speed have no place there",
+    ),
+    ("actuator_gaintype", "mjtGain.mjGAIN_SO3"): ("a servo of orientations", "write a <motor> about each axis"),
+    ("actuator_gaintype", "mjtGain.mjGAIN_USER"): ("gaintype user", "write fixed or affine"),
+    ("actuator_biastype", "mjtBias.mjBIAS_USER"): ("biastype user", "write none or affine"),
+    ("actuator_dyntype", "mjtDyn.mjDYN_USER"): ("dyntype user", "write none, integrator, filter or filterexact"),
+    ("actuator_trntype", "mjtTrn.mjTRN_SLIDERCRANK"): (
+        "a crank and slider",
+        "write the crank as a body, closed by <connect>",
+    ),
+    ("actuator_trntype", "mjtTrn.mjTRN_BODY"): ("adhesion", "take it out"),
 }
 
 
@@ -101,9 +122,35 @@ def absent(model: mujoco.MjModel) -> str:
     found = [f"{what} ({way})" for field, (what, way) in _ABSENT.items() if np.any(getattr(model, field, 0.0))]
     other = _polynomial(model) & ~np.isin(model.jnt_type, _AXIAL)
     if other.any():
-        names = ", ".join(model.joint(int(j)).name or f"joint{j}" for j in np.flatnonzero(other))
-        found.append(f"polynomial damping or stiffness of {names} (allowed: at hinges and slides)")
-    return "; ".join(found)
+        found.append(
+            f"polynomial damping or stiffness of {_named(model, 'joint', other)} (allowed: at hinges and slides)"
+        )
+    return "; ".join([*found, *_absent_drives(model)])
+
+
+def _absent_drives(model: mujoco.MjModel) -> list[str]:
+    """Actuators that MJX refuses or takes for others, by name, with what to write in their place."""
+    found, known = [], np.ones(len(model.actuator_group), bool)
+    for (field, value), (what, way) in _DRIVES.items():
+        kind, name = value.split(".")
+        own = getattr(model, field) == int(getattr(getattr(mujoco, kind), name, -1))
+        if own.any():
+            found.append(f"{what} at {_named(model, 'actuator', own)} ({way})")
+        known &= ~own
+    early = known & (model.actuator_actadr >= 0) & (getattr(model, "actuator_actearly", 0) > 0)
+    if early.any():
+        way = "take actearly out: forces then follow a timestep later"
+        found.append(f"actearly at {_named(model, 'actuator', early)} ({way})")
+    off = (model.opt.disableactuator >> np.clip(model.actuator_group, 0, 30)) & 1 == 1
+    if off.any():
+        way = "take it out of <option>, and these actuators, which do nothing, out of <actuator>"
+        found.append(f"actuatorgroupdisable of {_named(model, 'actuator', off)} ({way})")
+    return found
+
+
+def _named(model: mujoco.MjModel, kind: str, some: np.ndarray) -> str:
+    """Names of some joints or actuators (`[n]` bool), by number where they have none."""
+    return ", ".join(getattr(model, kind)(int(i)).name or f"{kind}{i}" for i in np.flatnonzero(some))
 
 
 def moved_to_joints(spec: mujoco.MjSpec) -> None:

@@ -98,7 +98,7 @@ def load(body: str, mass: float, place: tuple[float, float, float]) -> Cause:
     """Fix a point mass to a body."""
 
     def edit(spec: mujoco.MjSpec) -> None:
-        extra = spec.body(body).add_body(name="extra", pos=place)
+        extra = spec.body(body).add_body(name="extra", pos=place, ipos=(0, 0, 0))  # else ipos is pos, once more
         extra.explicitinertial, extra.mass, extra.inertia = True, mass, np.full(3, 1e-9)
 
     numbers = dict(zip(("com_x", "com_y", "com_z"), place, strict=True))

@@ -89,6 +89,24 @@ def test_payload_is_a_point_mass_welded_on():
     np.testing.assert_allclose(q[1], truth(edited(XML, make("payload", where="fore"), values), COMMAND), atol=1e-4)
 
 
+def test_a_payload_hangs_on_an_arm_whose_own_weight_is_carried():
+    """`gravcomp` is made for the robot as it was delivered: MuJoCo carries no body that was added."""
+    carried = XML.replace('<body name="upper">', '<body name="upper" gravcomp="1">').replace(
+        '<body name="fore" ', '<body name="fore" gravcomp=".8" '
+    )
+    spec, place = mujoco.MjSpec.from_string(carried), np.array([-0.03, 0.08, 0.1])
+    own = mujoco.MjModel.from_xml_string(carried).body("fore").ipos
+    load = spec.body("fore").add_body(pos=own + place, mass=0.7, inertia=np.full(3, 1e-9), ipos=np.zeros(3))
+    load.explicitinertial = True
+    effect = make("payload", where="fore")
+    real = truth(spec.compile(), COMMAND)
+    (q,) = moved(physics(carried, [effect]), [[0.7, *place]], COMMAND)
+    np.testing.assert_allclose(q, real, atol=2e-4)
+    assert np.abs(real - truth(mujoco.MjModel.from_xml_string(carried), COMMAND)).max() > 0.1
+    values = {"fore": dict(zip(("mass", "com_x", "com_y", "com_z"), (0.7, *place), strict=True))}
+    np.testing.assert_allclose(truth(edited(carried, effect, values), COMMAND), real, atol=1e-6)
+
+
 def heavy(own):
     """The compiled arm with other inertials, written into MuJoCo's own fields."""
     model = mujoco.MjModel.from_xml_string(XML)

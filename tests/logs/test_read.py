@@ -89,6 +89,7 @@ quantum: {"qpos:shoulder": 0.12}
         ("controller: {law: positon, kp: 3}", ("controller.law = 'positon'", "did you mean position?", "note")),
         ("controller: {law: position, kp: 3, kv: 1}", ("controller.kv: there are: law, kp",)),
         ("controller: {kp: 3}", ("controller.kp = 3 without a loop", "law: position")),
+        ("controller: {law: position, kp: 3, ki: 2}", ("controller.ki = 2", "allowed: 0", "with law: direct")),
         ("controller: {law: position, kp: .inf}", ("controller.kp = inf", "finite")),
         ("controller: {law: position, kp: 3, limit: 0}", ("controller.limit = 0", "a number > 0")),
         ("quantum: 3", ("quantum = 3", "mapping")),

@@ -21,6 +21,8 @@ XML = """
 """
 MOTOR = '<motor name="drive" joint="hinge"/>'
 SERVO = '<position name="drive" joint="hinge" kp="6" kv=".4" gear="2" forcerange="-2 2" {}/>'
+DC_MOTOR = '<dcmotor name="drive" joint="hinge" motorconst=".5" resistance="2" gear="2"/>'
+EARLY = '<general name="drive" joint="hinge" dyntype="filterexact" dynprm=".05" gainprm="2" actearly="{}"/>'
 DT, STEPS = 0.01, 60
 
 
@@ -83,11 +85,47 @@ def test_a_robots_file_is_read_so(tmp_path):
         ("", SERVO.format('delay=".02" nsample="4"'), r"an actuator's delay \(take delay= out"),
         ("", SERVO.format('damping=".1"'), r"an actuator's damping \(write damping times gear squared at its joint"),
         ('stiffness="1" springyield="20"', MOTOR, r"a joint's springyield"),
+        ("", DC_MOTOR, r"dcmotor at drive \(write <general gainprm=\"K/R\""),
+        ("", '<pid name="drive" joint="hinge" kp="5" ki="2"/>', r"pid at drive \(write <position kp= kv=/>"),
+        ("", EARLY.format("true"), r"actearly at drive \(take actearly out"),
+        ("", '<general joint="hinge" gaintype="user"/>', r"gaintype user at actuator0"),
     ],
 )
 def test_what_is_neither_is_refused_with_what_to_write(joint, actuator, said):
     with pytest.raises(UserError, match=said):
         Physics(mujoco.MjModel.from_xml_string(xml(joint, actuator)), DT, ParameterSpace())
+
+
+def test_what_is_written_in_the_place_of_a_dcmotor_moves_as_it_does():
+    K, R = 0.5, 2.0
+    written = f'<general joint="hinge" gear="2" gainprm="{K / R}" biastype="affine" biasprm="0 0 {-K * K / R}"/>'
+    true = by_mujoco(mujoco.MjModel.from_xml_string(xml("", DC_MOTOR)))
+    model = mujoco.MjModel.from_xml_string(xml("", written))
+    assert np.abs(by_mujoco(model) - true).max() < 1e-12
+    assert np.abs(by_us(model) - true).max() < 1e-5
+
+
+def test_a_robots_file_is_refused_so_too(tmp_path):
+    """A pid has two commands, more than there are actuators."""
+    (tmp_path / "a.xml").write_text(xml("", MOTOR + '<pid name="loop" joint="hinge" kp="5" ki="2"/>'))
+    with pytest.raises(UserError, match=r"a\.xml: MJX does not simulate pid at loop"):
+        robot.of_file(tmp_path / "a.xml")
+
+
+def test_iterations_that_mjx_has_not_are_told(tmp_path):
+    (tmp_path / "a.xml").write_text(xml('frictionloss=".1"').replace("<option ", '<option noslip_iterations="3" '))
+    with pytest.warns(UserWarning, match="noslip_iterations = 3: MJX has no such iterations"):
+        robot.of_file(tmp_path / "a.xml")
+
+
+def test_a_group_of_actuators_that_is_off_is_refused_by_name():
+    text = xml("", MOTOR + '<position name="trim" joint="hinge" kp="3" group="2"/>')
+    text = text.replace("<option ", '<option actuatorgroupdisable="2" ')
+    model = mujoco.MjModel.from_xml_string(text)
+    alone = mujoco.MjModel.from_xml_string(xml())
+    assert np.abs(by_mujoco(model) - by_mujoco(alone)).max() < 1e-12  # what the refusal says to write
+    with pytest.raises(UserError, match=r"actuatorgroupdisable of trim \(take it out of <option>, and these actuators"):
+        Physics(model, DT, ParameterSpace())
 
 
 @pytest.mark.parametrize(

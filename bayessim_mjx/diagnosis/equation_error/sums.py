@@ -30,16 +30,19 @@ class Layout:
     shared: actuators that drive a joint together with others; each has a column of its own effort.
     gains: (effect, actuator) of gains of servos and declared controllers; each has columns of what
         the effort gains with each of GAINS.
+    laden: loads on the bodies have ten columns of their own: what carries a body's weight (`gravcomp`) carries no load.
     """
 
     bodies: int
     nv: int
     shared: tuple[int, ...] = ()
     gains: tuple[tuple[str, int], ...] = ()
+    laden: bool = False
 
     @cached_property
     def _starts(self) -> dict[str, int]:
-        kinds = {"body": rigid_body.INERTIAL * self.bodies} | dict.fromkeys(OWN, 1)
+        inertial = rigid_body.INERTIAL * self.bodies
+        kinds = {"body": inertial, "laden": inertial * self.laden} | dict.fromkeys(OWN, 1)
         kinds |= {
             "zero": self.nv,
             "drive": len(self.shared),
@@ -62,6 +65,11 @@ class Layout:
 
     def body(self, i: int) -> slice:
         return slice(rigid_body.INERTIAL * i, rigid_body.INERTIAL * (i + 1))
+
+    def load(self, i: int) -> slice:
+        """Of a load on a body."""
+        start = self.at("laden") if self.laden else 0
+        return slice(start + rigid_body.INERTIAL * i, start + rigid_body.INERTIAL * (i + 1))
 
     def drive(self, actuator: int) -> int:
         """Of one of the actuators `shared`."""
@@ -116,7 +124,7 @@ def layout_of(model: mujoco.MjModel, bodies: int, loops: Mapping[str, NDArray[np
         if dof is not None
         and (loops[kind.loop][i] if kind.loop else issubclass(kind, OfGains) and kind.carries(model, i))
     ]
-    return Layout(bodies, model.nv, shared, tuple(gains))
+    return Layout(bodies, model.nv, shared, tuple(gains), bool(model.ngravcomp))
 
 
 def columns(
@@ -128,7 +136,9 @@ def columns(
         source: `[nv]`, see `drives.sources`; slow: `[nv]`, speeds at which dry friction turns over.
     """
     moved = motion(log, model)
-    found = Regressor.of(model, moved, slow)
+    inertial = rigid_body.INERTIAL * layout.bodies * layout.laden
+    twice = np.tile(np.eye(inertial).reshape(inertial, -1, rigid_body.INERTIAL), (2, 1, 1)) if layout.laden else None
+    found = Regressor.of(model, moved, slow, twice, loads=inertial)
     x = np.zeros((len(moved.time), model.nv, layout.size))
     for v, column in rigid_body.by_zeros(model, moved.qpos, moved.qvel, moved.qacc).items():
         x[:, :, layout.at("zero") + v] = moved.smooth(column)

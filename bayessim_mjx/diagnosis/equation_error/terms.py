@@ -235,8 +235,8 @@ def _load(layout: Layout, body: int, centre: Array, turn: Array) -> Callable[[Ar
         place = _place(last)
         slopes = np.stack([(point(place + d) - point(place - d)) / 2 for d in steps], -1)  # exact: it is quadratic
         out = np.zeros((layout.nv, layout.size, 4))
-        out[:, layout.body(body), 0] = point(place) - slopes @ place
-        out[:, layout.body(body), 1:] = slopes
+        out[:, layout.load(body), 0] = point(place) - slopes @ place
+        out[:, layout.load(body), 1:] = slopes
         return out
 
     return shape

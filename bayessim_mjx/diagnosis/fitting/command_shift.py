@@ -1,13 +1,15 @@
 """Do commands act when the log says? The time by which they act later or earlier, beside all that forces can explain.
 
-Windows are simulated at shifted commands, and linearised in the shift, the known parameters, the actuators' gains and
-forces of each joint (constant, with position, with speed, with its direction). What remains for the shift is its own:
-friction or a wrong damping do not become one. No drive acts before its command, so a lead is a fault of the log.
+Windows are simulated at shifted commands, and linearised in the shift, the known parameters, the actuators' gains, kp
+and kv of servos, and forces of each joint (constant, with position, with speed, with its direction). What remains for
+the shift is its own: friction or a wrong damping do not become one. No drive acts before its command, so a lead is a
+fault of the log.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -17,9 +19,11 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.data_sheet import WORST
 from bayessim_mjx.diagnosis.fitting.candidates import STEP
 from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation
+from bayessim_mjx.diagnosis.fitting.integrator_choice import GAINS
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
 from bayessim_mjx.diagnosis.fitting.substep_errors import Case, Errors
 from bayessim_mjx.diagnosis.fitting.windows import Windows
+from bayessim_mjx.diagnosis.logcheck.drives import dof_of
 from bayessim_mjx.diagnosis.logcheck.timing import SURE
 from bayessim_mjx.effects.support.motion import AROUND
 
@@ -48,15 +52,15 @@ class Shift:
     @property
     def certain(self) -> bool:
         """Whether it explains more than all else that is missing does, in all conditions alike."""
-        return self._shows(abs(self.late), self.error + self.apart) and self.explains > 1 - self.explains
+        return self._shows(abs(self.late), self.error + self.apart)
 
     @property
     def likely(self) -> bool:
-        """Whether there is a lead, but beside a gap that something else has to explain."""
+        """Whether there is a lead that explains as much, but by conditions' own shifts beside something else."""
         return self._shows(-self.late, self.error) and not self.certain
 
     def _shows(self, size: float, error: float) -> bool:
-        return size > max(SURE * error, LEAST * self.step)
+        return size > max(SURE * error, LEAST * self.step) and self.explains > 1 - self.explains
 
     @property
     def lead(self) -> float:
@@ -101,20 +105,28 @@ def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -
     precision = np.full(model.size, WORST**-2)
     x, starts = np.zeros(model.size), np.zeros_like(errors.offsets)
     r = model.residual(x, starts)
-    A = model.columns()
+    A, linear = model.columns(x, starts, r), x  # where the derivatives are those of
     B = errors.columns(sigma)
-    share, gained = 1.0, np.inf
-    while gained > len(cut) and abs(x[0]) < 1:  # a squared noise a window; by derivatives at the beginning
+    least, gained, change = (
+        1e-6,
+        np.inf,
+        np.full(model.size, np.inf),
+    )  # damping, of a curvature; by Levenberg, Marquardt
+    damping = least
+    while (gained > len(cut) or damping > least) and abs(x[0]) < 1 and np.abs(change).max() > STEP:
         q, found = eliminate(r, A, B, errors.offsets + starts, cut.spread)
         g, S = q.weighted(np.ones(len(cut)))
-        change = share * np.asarray(np.linalg.solve(S + np.diag(precision), g - precision * x), np.float64)
-        moved = x + change, starts + share * found.step(A, change / share)
+        held = S + np.diag(precision + damping * np.diag(S))
+        change = np.asarray(np.linalg.solve(held, g - precision * x), np.float64)
+        moved = x + change, starts + found.step(A, change)
         there = model.residual(*moved)
         gained = float(np.sum(r**2) - np.sum(there**2))
         if gained > 0:
-            (x, starts), r = moved, there
-        elif share == 1:
-            share, gained = 0.5, np.inf
+            (x, starts), r, damping = moved, there, max(damping / 6, least)
+        elif linear is not x:
+            (A, linear), gained = (model.columns(x, starts, r), x), np.inf
+        else:
+            damping, gained = 6 * damping, np.inf
     if abs(x[0]) >= 1:
         return None
     return _judged(eliminate(r, A, B, errors.offsets + starts, cut.spread)[0], x, precision, cut, r.size - starts.size)
@@ -123,7 +135,8 @@ def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -
 class _Model:
     """Whitened residuals `[W, n]` as a function of (shift, parameters, gains, forces), each in units of its scale.
 
-    That of the shift is `AROUND`; of parameters their range, or `WORST` of their value; of gains 1.
+    That of the shift is `AROUND`; of parameters their range, or `WORST` of their value; of servos' own gains (`GAINS`)
+    their range; of the commands' gains 1.
     """
 
     def __init__(self, errors: Errors, late: Shifted, sigma: Array, force: Array, factor: int) -> None:
@@ -131,15 +144,22 @@ class _Model:
         space = errors.physics.space
         low, high = (np.array([getattr(p, end) for p in space.parameters]) for end in ("low", "high"))
         self.nominal, self.positive = np.asarray(space.nominal, float), low > 0
-        self.span = np.where(self.nominal != 0, np.minimum(high - low, WORST * np.abs(self.nominal)), high - low)
-        self.forces = _shapes(errors.cut) * force  # [4, W, H, nv]
-        self.parts = np.cumsum([1, len(low), errors.physics.mj_model.nu])
-        self.size = int(self.parts[-1]) + 4 * len(force)
+        known = np.array([p.kind != "effect" for p in space.parameters], bool) & (self.nominal != 0)
+        self.span = np.where(known, np.minimum(high - low, WORST * np.abs(self.nominal)), high - low)
+        model = errors.physics.mj_model
+        acts = np.ones((4, model.nv), bool)  # but where kp and kv do the same (position, speed), more exactly
+        for i, (row, kind) in itertools.product(range(model.nu), enumerate(GAINS, 1)):
+            if kind.carries(model, i) and (v := dof_of(model, i)) is not None:
+                acts[row, v] = False
+        shape, dof = np.nonzero(acts)
+        self.forces = (_shapes(errors.cut) * force)[shape, :, :, dof, None] * np.eye(len(force))[dof, None, None]
+        self.parts = np.cumsum([1, len(low), model.nu])
+        self.size = int(self.parts[-1]) + len(dof)
 
-    def columns(self) -> Array:
-        """`[W, n, size]`, minus the derivatives of the residuals."""
-        first, *there = self._residuals([np.zeros(self.size), *STEP * np.eye(self.size)])
-        return np.stack([(first - moved) / STEP for moved in there], -1)
+    def columns(self, x: Array, starts: Array, residual: Array) -> Array:
+        """`[W, n, size]`, minus the derivatives of the residuals `[W, n]` at x and starts."""
+        there = self._residuals(x + STEP * np.eye(self.size), starts)
+        return np.stack([(residual - moved) / STEP for moved in there], -1)
 
     def residual(self, x: Array, starts: Array) -> Array:
         """Simulate; starts: `[W, 2 nv]`, further changes of the start states."""
@@ -158,16 +178,18 @@ class _Model:
         cut = self.late(AROUND * float(shift[0]))
         command = np.asarray(cut.batch.command) * (1 + np.asarray(gains, np.float32))
         cut = dataclasses.replace(cut, batch=cut.batch.replace(command=command))
-        force = np.einsum("fv,fwhv->whv", loads.reshape(4, -1), self.forces)
+        force = np.tensordot(loads, self.forces, 1)
         return Case(cut, starts, theta, force)
 
 
 def _shapes(cut: Windows) -> Array:
     """`[4, W, H, nv]`, of size 1 at most times: constant, with position, with speed, with the direction of motion.
 
-    Of measured motion, smoothed: the velocity of the logs, at the same rows. Directions are as sure as it is.
+    Of measured motion, smoothed: the velocity of the logs. A force holds over a control step: the mean of both ends.
+    That of its end would lead by half a step, and a servo's wrong damping would look like commands that do.
+    Directions are as sure as a velocity is.
     """
-    rows = [slice(int(a) + 1, int(a) + 1 + cut.steps) for a in cut.start]
+    rows = [slice(int(a), int(a) + 1 + cut.steps) for a in cut.start]
     speed = np.stack([cut.logs[log].qvel[own] for log, own in zip(cut.log, rows, strict=True)])
     noise = np.stack([cut.logs[log].sigma_qvel for log in cut.log])[:, None]
     typical = np.maximum(np.sqrt(np.mean(speed**2, (0, 1))), 1e-12)
@@ -175,7 +197,8 @@ def _shapes(cut: Windows) -> Array:
     travel = travel - travel.mean(1, keepdims=True)
     reach = np.maximum(np.abs(travel).max((0, 1)), 1e-12)
     direction = np.tanh(speed / np.maximum(noise, 1e-12))
-    return np.stack([np.ones_like(speed), travel / reach, speed / typical, direction])
+    ends = np.stack([np.ones_like(speed), travel / reach, speed / typical, direction])
+    return np.asarray(0.5 * (ends[:, :, :-1] + ends[:, :, 1:]))
 
 
 def _judged(q: Quadratic, x: Array, precision: Array, cut: Windows, count: int) -> Shift:

@@ -23,11 +23,15 @@ from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
 from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, simulated
 from bayessim_mjx.diagnosis.fitting.observation import Stepper
 from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts
+from bayessim_mjx.effects.servo_damping import ServoDamping
+from bayessim_mjx.effects.servo_stiffness import ServoStiffness
+from bayessim_mjx.effects.support.site import element_names
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics.native import rubbing
 
 Array = NDArray[np.float64]
 # (robot's physics, first=coarsest stable factor) -> (the windows, the error of the time step)
+GAINS = (ServoStiffness, ServoDamping)  # kp and kv: a servo's least known numbers, which move it in time
 Measured = Callable[..., tuple[Any, Discretisation]]
 TOO_LONG = "the model's time step shows beside the noise, and in the time given nothing finer can be searched with"
 RK4, IMPLICITFAST = int(mujoco.mjtIntegrator.mjINT_RK4), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
@@ -128,18 +132,20 @@ def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, lef
     Args:
         left: s that one simulation of all windows may take, for the search to end in time.
     """
-    own = robot.physics(dt)
+    own, names = robot.physics(dt), element_names(robot.mj_model, "actuator")
+    carried = {k: tuple(n for i, n in enumerate(names) if k.carries(robot.mj_model, i)) for k in GAINS}
+    gains = [kind(where=where) for kind, where in carried.items() if where]  # what `command_shift` has beside its shift
     precise = not contacts(own) and not simulated(own.mj_model, logs).all()
     robot = dataclasses.replace(robot, rubbing=rubbing(robot.mj_model) if precise else ())
     stable = coarsest_stable(own.mj_model, logs, precise)
     better = stable.robot(robot)
-    cuts, worth = measured(better.physics(dt), first=stable.factor)
+    cuts, worth = measured(better.physics(dt, gains), first=stable.factor)
     if not stable.changed or stable.integrator != RK4:
         return Choice(better, stable, cuts, worth)
     if worth.errors and worth.errors.seconds >= left:
         stable = coarsest_stable(own.mj_model, logs)
         robot = stable.robot(robot)
-        return Choice(robot, stable, *measured(robot.physics(dt), first=stable.factor), better=(TOO_LONG,))
+        return Choice(robot, stable, *measured(robot.physics(dt, gains), first=stable.factor), better=(TOO_LONG,))
     step = 1e3 * worth.timestep / worth.factor
     text = f"the diagnosis simulates by RK4 at {step:.3g} ms: errors of the model's integrator could pass for effects"
     return Choice(better, stable, cuts, worth, better=(text,))

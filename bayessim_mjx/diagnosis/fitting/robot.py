@@ -310,15 +310,18 @@ def check_simulable(model: mujoco.MjModel, source: str, lean: mujoco.MjModel | N
         raise UserError(f"{source}: <option timestep> = {step:g}; allowed: seconds > 0")
     if broken := _not_finite(model):
         raise UserError(f"{source}: numbers that are not finite in {', '.join(broken)}; allowed: finite numbers")
+    if why := absent(model):
+        raise UserError(f"{source}: MJX does not simulate {why}")
     idle = [label(model, "actuator", i) for i in range(model.nu) if not np.any(model.actuator_gear[i])]
     if len(idle) == model.nu:
         raise UserError(f"{source}: gear = 0 of every actuator ({', '.join(idle)}): the logged commands cannot act")
     if idle:
         warnings.warn(f"{source}: gear = 0 of {', '.join(idle)}: these commands do nothing", stacklevel=3)
+    if model.opt.noslip_iterations:
+        text = "MJX has no such iterations, so contacts and dry friction creep as they do without them"
+        warnings.warn(f"{source}: noslip_iterations = {model.opt.noslip_iterations}: {text}", stacklevel=3)
     if model.nplugin:
         raise UserError(f"{source}: MJX cannot simulate this model: it has plugins")
-    if why := absent(model):
-        raise UserError(f"{source}: MJX does not simulate {why}")
     try:
         mjx.make_data(mjx.put_model(model if lean is None else lean, impl="jax"))
     except (NotImplementedError, ValueError, TypeError) as error:
@@ -347,6 +350,7 @@ _REMEDIES = {
     "mjGEOM": "use other shapes for these geoms",
     "fluid": "use the integrator Euler, or density and viscosity 0",
     "mjtSensor": "take these sensors out: a diagnosis reads joints",
+    "ConeType.ELLIPTIC": "write condim 3, or cone pyramidal",
     "not supported": "MJX has motor, position, velocity and general actuators on joints, tendons and sites",
 }
 

@@ -146,7 +146,8 @@ class _Picture:
             sets.append(np.zeros_like(inertia))
             sets[-1][moving.index(body)] = inertial(1.0, place, np.zeros((3, 3)))
             most.append(heaviest)
-        return cls(Regressor.of(model, motion(log, model, cutoff), sets=np.array(sets)), len(moving), np.array(most))
+        moved, loads = motion(log, model, cutoff), len(sets) - len(moving)
+        return cls(Regressor.of(model, moved, sets=np.array(sets), loads=loads), len(moving), np.array(most))
 
     def bounded(self, dof: int, laden: bool) -> Bounded:
         """Return the linear model of the effort at one degree of freedom.

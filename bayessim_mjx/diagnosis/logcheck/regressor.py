@@ -135,16 +135,16 @@ class Regressor:
 
     @classmethod
     def of(
-        cls, model: mujoco.MjModel, moved: Motion, slow: Array | None = None, sets: Array | None = None
+        cls, model: mujoco.MjModel, moved: Motion, slow: Array | None = None, sets: Array | None = None, loads: int = 0
     ) -> Regressor:
         """Args: slow: `[nv]`, speeds at which dry friction turns over; None: by this motion's top speeds.
 
-        sets: see `rigid_body.rigid`.
+        sets, loads: see `rigid_body.rigid`.
         """
         v = moved.qvel
         slow = LEAST * np.percentile(np.abs(v), 95, axis=0) + 1e-12 if slow is None else slow
         dry = np.tanh(v / slow)
-        rigid = rigid_body.rigid(model, moved.qpos, v, moved.qacc, sets)
+        rigid = rigid_body.rigid(model, moved.qpos, v, moved.qacc, sets, loads)
         known = rigid.nominal + rigid.spring + model.dof_damping * v + model.dof_armature * moved.qacc
         known += model.dof_frictionloss * dry
         position = np.zeros_like(v) + np.cumsum(v, 0) * moved.step

@@ -162,11 +162,14 @@ class Rigid:
     spring: Array
 
 
-def rigid(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array, sets: Array | None = None) -> Rigid:
+def rigid(
+    model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array, sets: Array | None = None, loads: int = 0
+) -> Rigid:
     """Of a motion `[T, nq]`, `[T, nv]`, `[T, nv]`.
 
     Args:
         sets: `[K, B, 10]`, inertial parameters of which each column is made; None: one column each, of body after body.
+        loads: how many sets, the last, are loads that `gravcomp` does not carry.
     """
     own, parts = nominal(model), []
     acts = 1.0 - model.body_gravcomp[moving_bodies(model), None, None]  # share of gravity that the drives feel
@@ -176,6 +179,8 @@ def rigid(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array, sets: Ar
         whole, down = frames.columns(), frames.weight(gravity(model))
         each = whole - (1.0 - acts) * down
         columns = np.moveaxis(each, 1, 2) if sets is None else np.einsum("tbvk,cbk->tvc", each, sets)
+        if loads and sets is not None:
+            columns[..., -loads:] = np.einsum("tbvk,cbk->tvc", whole, sets[-loads:])
         needed, weight = (np.einsum("tbvk,bk->tv", x, own) - frames.held for x in (whole, down))
         tilt = np.stack([np.einsum("tbvk,bk->tv", acts * frames.weight(x), own) for x in falls], -1)
         columns = columns.reshape(*needed.shape, -1)

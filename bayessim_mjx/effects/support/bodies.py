@@ -45,9 +45,14 @@ def velocity(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray) -> jax.Ar
     return linear + jnp.cross(angular, _arm(model, data, ids))
 
 
-def project(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray, force: jax.Array) -> jax.Array:
-    """Generalised force `[nv]` of forces `[n, 3]` (N, world) at the bodies' centres of mass."""
-    wrench = jnp.concatenate([jnp.cross(_arm(model, data, ids), force), force], axis=1)
+def project(
+    model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray, force: jax.Array, away: jax.Array | float = 0.0
+) -> jax.Array:
+    """Generalised force `[nv]` of forces `[n, 3]` (N, world) at the bodies' centres of mass, or `away` `[n, 3]` of it.
+
+    away: m, in the world's axes.
+    """
+    wrench = jnp.concatenate([jnp.cross(_arm(model, data, ids) + away, force), force], axis=1)
     return jnp.sum(data.cdof * (moved(model)[ids].T @ wrench), axis=1)  # sum_b J_b^T f_b
 
 
@@ -95,6 +100,20 @@ def _jacobian(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray, frame: j
 def _arm(model: mujoco.MjModel, data: "mjx.Data", ids: np.ndarray) -> jax.Array:
     """From the point that MuJoCo's spatial vectors of the tree refer to."""
     return data.xipos[ids] - data.subtree_com[model.body_rootid[ids]]
+
+
+def uncompensated(at: Site, step: SubStep, mass: jax.Array, place: jax.Array) -> jax.Array:
+    """Generalised force `[nv]`: weight of loads that the model's `gravcomp` does not know; MuJoCo's grows with them.
+
+    A controller or a counterweight carries the robot that it was made for.
+
+    Args:
+        mass: `[n]`, kg, of the loads on the site's bodies; place: `[n, 3]`, m from the bodies' centres of mass as they
+            are with the loads, in the bodies' axes.
+    """
+    away = jnp.einsum("nij,nj->ni", jnp.reshape(step.data.xmat, (-1, 3, 3))[at.ids], place)
+    share = step.model.body_gravcomp[at.ids] * mass
+    return project(at.mj_model, step.data, at.ids, share[:, None] * step.model.opt.gravity, away)
 
 
 def inertial_site(effect: "Effect", model: mujoco.MjModel, timestep: float, substeps: int) -> Site:

@@ -38,3 +38,16 @@ def test_nothing_is_missing_where_nothing_is_hidden(name: str):
     found = gate.check(logs, model, 0.01)
     assert len(found.usable) == 2 and not found.warnings
     assert all((r.explained or 0.0) > 0.95 for report in found.reports for r in report.relations)
+
+
+def test_a_load_on_a_compensated_arm_is_a_payload():
+    """What carries the arm's weight carries no body that was added: its weight is on the drives."""
+    spec = mujoco.MjSpec.from_string(COMPENSATED)
+    place = mujoco.MjModel.from_xml_string(COMPENSATED).body_ipos[-1]
+    load = spec.bodies[-1].add_body(pos=place, mass=0.3, inertia=np.full(3, 1e-8), ipos=np.zeros(3))
+    load.explicitinertial = True
+    logs = [record(spec.to_xml(), follow(k), sigma=5e-5, name=f"{k}.npz", seed=k) for k in (0, 1)]
+    seen = check(logs, mujoco.MjModel.from_xml_string(COMPENSATED))
+    (found,) = seen.proposals
+    assert found.term.effect == "payload" and seen.explained > 0.95
+    assert found.parameters["mass"] == pytest.approx(0.3, rel=0.05)

@@ -102,7 +102,7 @@ DCMOTOR = '<actuator><dcmotor joint="shoulder" motorconst="0.1" resistance="1"/>
 BAD = {
     "no joints": ({"rest": ""}, r"a\.xml: the model has no actuator"),
     "collision": ({"world": SOLID}, r"MJX cannot simulate this model: .*ELLIPSOID.*BOX.* \(switch the contacts"),
-    "actuator": ({"rest": DCMOTOR}, r"MJX cannot simulate this model: .*DCMOTOR.*not supported \(MJX has motor"),
+    "actuator": ({"rest": DCMOTOR}, r"MJX does not simulate dcmotor at actuator0 \(write <general gainprm"),
     "solver": ({"option": 'solver="PGS"'}, r"a\.xml: MJX cannot simulate this model: mjtSolver.mjSOL_PGS .use CG"),
     "timestep": ({"option": 'timestep="0"'}, r"a\.xml: <option timestep> = 0; allowed: seconds > 0"),
     "nan": ({"option": 'timestep="nan"'}, r"a\.xml: <option timestep> = nan; allowed: seconds > 0"),

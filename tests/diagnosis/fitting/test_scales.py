@@ -1,5 +1,7 @@
 """Scales of a robot with a floating base: noise and range of motion belong to the joint whose they are."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -31,10 +33,18 @@ def setting():
 
 
 def test_noise_by_degree_of_freedom(setting):
-    """A quaternion changes by half the angle: q = (cos a/2, n sin a/2)."""
-    turn = 2 * np.sqrt(12.5e-6)
-    expected = [0.1, 0.2, 0.3, turn, turn, turn, 0.02, 0.02, 0.02, 0.5, 1e-4]
-    np.testing.assert_allclose(setting[1].sigma_dofs, expected, rtol=1e-12)
+    """A turn by w moves a quaternion by |w| / 2, whatever its orientation: the columns share three turns' noise."""
+    model, log = setting
+    rng, noise = np.random.default_rng(0), 4e-3
+    shaken = np.tile([0.1, 0.7, -0.5, 0.5], (20_000, 1))
+    for row in shaken:
+        row /= np.linalg.norm(row)
+        mujoco.mju_quatIntegrate(row, noise * rng.normal(size=3), 1.0)
+    spread = np.std(shaken, axis=0)
+    assert spread.max() > 1.3 * spread.min()  # no column has its share alone
+    sigma = np.r_[log.sigma_qpos[:3], spread, spread, log.sigma_qpos[11:]]
+    found = dataclasses.replace(log, sigma_qpos=sigma).sigma_dofs
+    np.testing.assert_allclose(found, [0.1, 0.2, 0.3, *[noise] * 6, 0.5, 1e-4], rtol=0.02)
 
 
 def test_a_joint_moves_by_its_own_noise(setting):
