@@ -2,8 +2,9 @@
 
     python docs/make_pictures.py [--work DIR] [--only loop diagnosis]
 
-Runs `main --task Pendulum` with three rounds and `diagnose` on the logs of examples/diagnose_pendulum.py, each in a
-pseudo-terminal (Linux, macOS), about five minutes together on two cores. What is already in --work is not run again.
+Runs `main --task Pendulum`, the first command of README, and `diagnose` on the logs of examples/diagnose_pendulum.py,
+each in a pseudo-terminal (Linux, macOS), about ten minutes together on two cores. What is already in --work is not run
+again.
 
 - loop.svg, diagnosis.svg: the terminal, by rich's export
 - posterior.png: the corner plot of the last round
@@ -40,7 +41,7 @@ LARGEST = {".svg": 200_000, ".png": 200_000, ".gif": 1_000_000, ".html": 300_000
 PLOTLY = re.compile(r"<script>/\*\*\s*\* plotly\.js.*?</script>", re.DOTALL)
 GIF = "fps=15,scale=240:-1:flags=lanczos,split[a][b];[a]palettegen=max_colors=64[p];[b][p]paletteuse=dither=none"
 PLAY = "play --task Pendulum --checkpoint best --video"
-LOOP = "main --task Pendulum bayessim.realIters=3"
+LOOP = "main --task Pendulum"
 DIAGNOSIS = "diagnose --task Pendulum --data motion --out found"
 EFFECTS = "coulomb_friction,viscous_friction,actuator_gain,actuator_delay,joint_offset"
 DARK = [(40, 42, 46), (179, 38, 30), (46, 125, 50), (160, 106, 0), (21, 101, 192), (123, 31, 162), (0, 121, 107)]
