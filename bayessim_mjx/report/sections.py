@@ -11,7 +11,7 @@ from bayessim_mjx.diagnosis.phrases.verdict import number as noise_sd
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.diagnosis.statistics import of_one
 from bayessim_mjx.quantities import count, finite
-from bayessim_mjx.report import gap_figures, marks, place_figures
+from bayessim_mjx.report import gap_figures, horizon_figures, marks, place_figures
 from bayessim_mjx.report.choice import choice
 from bayessim_mjx.report.look import STAGE
 from bayessim_mjx.report.words import (
@@ -98,7 +98,7 @@ def how_far(d: Diagnosis) -> dict[str, Any]:
     start = next((k for k, (name, _) in enumerate(falls) if same and name == str(same[0]["name"])), 0)
     return {
         "choice": choice(["horizon"], [((name,), f) for name, f in falls], start),
-        "horizons": gap_figures.horizons(d.gap.horizons, bool(d.effects)),
+        "horizons": horizon_figures.horizons(d.gap.horizons, bool(d.effects)),
         "table": _table(d, [_stages_row(r, len(d.gap.physical)) for r in rows if finite(r.get("nominal"))]),
         "channels": _table(d, _channels(d)),
         "repeated": repeated(d),

@@ -210,7 +210,7 @@ def test_no_bar_is_longer_than_its_scale(tmp_path):
     for k in range(len(worse)):
         assert sum(t["x"][k] for t in stacked[0]["data"]) <= 1.0 + 1e-9
     falls = [t for f in page.figures for t in f["data"] if t["type"] == "bar" and "base" in t]
-    assert falls and max(b + y for t in falls for b, y in zip(t["base"], t["y"], strict=True)) <= 1.0 + 1e-9
+    assert falls and max(b + y for t in falls for b, y in zip(t["base"], t["x"], strict=True)) <= 1.0 + 1e-9
     assert "249" not in page.text and "none, it is worse" in page.text
 
 
