@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
-from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
+from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, spelt, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
 from bayessim_mjx.diagnosis.phrases.verdict import number as noise_sd
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
@@ -33,6 +33,7 @@ from bayessim_mjx.report.words import (
 
 MOST_CANDIDATES = 20  # in the table; no source: a matter of style
 OPEN_WARNINGS = 3  # more are folded away; no source: a matter of style
+TINY = 1e-6  # in SI units: smaller values in the table of candidates are zeros of a fit; no source: a matter of style
 EFFECTS = STAGE["with_effects"]
 TILES = {
     "nominal": "as delivered",
@@ -240,10 +241,10 @@ def _own(candidate: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _value(name: str, value: Any) -> str:
-    words = name.rpartition(".")[2].replace("_", " ")
+    words = spelt(name.rpartition(".")[2])
     if isinstance(value, Mapping):
         return f"{words} {estimate(value.get('mean'), value.get('sd'), value.get('unit', ''))}"
-    return f"{words} {number(value)}"
+    return f"{words} {number(0 if finite(value) and abs(value) < TINY else value)}"
 
 
 def where(d: Diagnosis) -> dict[str, Any]:

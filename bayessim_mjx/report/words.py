@@ -97,12 +97,14 @@ def quantity(name: str, value: Estimate) -> tuple[str, str]:
 
 
 def not_fitted(d: Diagnosis, most: int | None = None) -> list[str]:
-    """`no gain at first order: Payload · link, ...` for each reason; at most so many of each."""
+    """`no gain at first order: Payload (link, tool), ...` for each reason; at most so many effects of each."""
     lines = []
     for reason, labels in d.not_fitted.items():
-        more = len(labels) - len(labels[:most])
-        named = ", ".join(label_title(label, short=True) for label in labels[:most])
-        lines.append(f"{reason}: {named}" + (f" and {more} more" if more else ""))
+        laws: dict[str, list[str]] = {}
+        for law, _, place in (label_title(label, short=True).partition(" · ") for label in labels):
+            laws.setdefault(law, []).append(place)
+        each = [f"{law} ({', '.join(at)})" if any(at) else law for law, at in laws.items()]
+        lines.append(f"{reason}: {quantities.listed(each, most=most)}")
     return lines
 
 

@@ -159,7 +159,7 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
         why = (
             whys[0].removeprefix(f"{kind.name}: ")
             if found
-            else f"no {kind.kind} here that could carry it and was excited"
+            else f"these logs excite no {kind.kind} that it could act at"
         )
         if found or not kind.floats:
             without.setdefault(why, []).append(kind.name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -97,7 +98,12 @@ def quantity(name: str, value: Estimate) -> tuple[str, str]:
         sd = value.sd / value.mean**2 if finite(value.sd) else value.sd  # d(1/x) = dx / x^2
         turned = {"at least": "at most", "at most": "at least"}.get(value.bound, value.bound)
         return RECIPROCALS[name], _bounded(measured(1 / value.mean, sd, _turned(value.unit)), turned)
-    return name.replace("_", " "), _bounded(measured(value.mean, value.sd, value.unit), value.bound)
+    return spelt(name), _bounded(measured(value.mean, value.sd, value.unit), value.bound)
+
+
+def spelt(name: str) -> str:
+    """Return a parameter's name in words: `com_x` -> `centre of mass x`."""
+    return re.sub(r"^com ", "centre of mass ", name.replace("_", " "))
 
 
 def _bounded(text: str, bound: str) -> str:

@@ -11,7 +11,7 @@ from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.equation_error.search import Proposal
 from bayessim_mjx.diagnosis.logcheck.drives import LEAST
 from bayessim_mjx.diagnosis.logcheck.links import Channel
-from bayessim_mjx.diagnosis.phrases.effects import CLEAR, any_of, measured, multiplied, titled
+from bayessim_mjx.diagnosis.phrases.effects import CLEAR, any_of, measured, multiplied, spelt, titled
 from bayessim_mjx.diagnosis.request import Tolerance
 from bayessim_mjx.odometry.base import Base
 from bayessim_mjx.odometry.stand import Stand
@@ -244,8 +244,6 @@ def _mechanism(look: Look) -> str:
 def _proposal(p: Proposal) -> str:
     each = [(k, v, sd if (sd := p.deviations[k]) < 1e6 else None) for k, v in p.parameters.items() if v]
     own = p.term.modelled
-    numbers = ", ".join(
-        multiplied(own[k], v, sd) if k in own else f"{k.replace('_', ' ')} {measured(v, sd)}" for k, v, sd in each
-    )
+    numbers = ", ".join(multiplied(own[k], v, sd) if k in own else f"{spelt(k)} {measured(v, sd)}" for k, v, sd in each)
     rivals = any_of(p.rivals, MOST)
     return f"first guess: {titled(p.term.effect, p.term.where)}: {numbers}{f'; or {rivals}' if rivals else ''}"

@@ -41,7 +41,7 @@ ELSEWHERE = (
     "the choice compares had seen every condition."
 )
 IN_SAMPLE = "These numbers are in sample: one log is one operating condition, and other conditions may differ."
-WITHIN = "Every joint is within its tolerance (closest: {within})."
+WITHIN = "Every joint is within its tolerance. The closest is {within}."
 PROBABLE = (
     "Probability among all fitted explanations: {own} for this one, {others}, {nothing} for the known parameters alone."
 )
@@ -267,8 +267,9 @@ def _within(far: Gap) -> str:
         return ""
     row = far.physical[name]
     noise, unit = row.get("noise", 0.0), row["unit"]
-    above = float(above_noise(row["with_effects"], noise))
-    return f"{name}, {extent(above, unit)} of {extent(max(row['tolerance'], noise), unit)}, noise subtracted"
+    above, limit = float(above_noise(row["with_effects"], noise)), max(row["tolerance"], noise)
+    part = f" ({percent(limit / row['motion'])} of its motion)" if row["motion"] else ""
+    return f"{name}: {extent(above, unit)} above the noise, tolerance {extent(limit, unit)}{part}"
 
 
 def _by_joint(far: Gap, effects: bool) -> str:

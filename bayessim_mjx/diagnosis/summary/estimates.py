@@ -137,7 +137,7 @@ def _effect(found: Findings, effect: Candidate, sd: Array, part: dict[str, Any])
             if deviation > UNIFORM * (c.high - c.low)
             else ""
         )
-        ends += [f"{word.replace('_', ' ')} {clause}"] if clause else []
+        ends += [f"{phrases.spelt(word)} {clause}"] if clause else []
     shared = _shared(effect, size_of(effect, model.fit.values[own], sd[own]), weighed, weights)
     return FoundEffect(
         name=effect.effect,
