@@ -53,7 +53,8 @@ def test_an_estimate_is_printed_as_it_is_rounded_by_its_uncertainty(value, text)
         (effect("payload", "tool", mass=(0.99, 0.01, "kg"), com_x=(0.01, 0.1, "m")),
          "an extra payload at tool (mass 0.990 +- 0.010 kg)"),
         (effect("payload", "tool", mass=(0.99, 0.01, "kg"), com_x=(1.0, 0.1, "m"), com_y=(1.0, 0.1, "m")),
-         "an extra payload at tool (mass 0.990 +- 0.010 kg, centre of mass x 1.00 +- 0.10 m, centre of mass y 1.00 +- 0.10 m)"),
+         "an extra payload at tool (mass 0.990 +- 0.010 kg, centre of mass x 1.00 +- 0.10 m, "
+         "centre of mass y 1.00 +- 0.10 m)"),
         (effect("my_effect", "elbow"), "my effect at elbow"),
     ],
 )  # fmt: skip
