@@ -22,7 +22,7 @@ from bayessim_mjx.report.words import STAGES, known_span, number, percent, wide
 
 # what takes the squared gap down to each stage
 PARTS = {
-    "calibrated": "recalibrated parameters",
+    "calibrated": "recalibration alone",
     "with_effects": "named effects",
     "reducible_floor": "not explained",
     "noise_floor": "not explained",
