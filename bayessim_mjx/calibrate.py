@@ -29,7 +29,7 @@ ADVICE = {
 
 
 def _parser() -> cli.PlainParser:
-    about = "Test a finished run's posterior on fresh simulations, and whether real motion looks like them."
+    about = "Test a finished run's posterior on fresh simulations, and compare real motion with them."
     parser = cli.PlainParser("calibrate", description=about, usage="%(prog)s --run RUN [options]")
     tests, computing = parser.group("test"), parser.group("computing")
     tests.add_argument("--run", metavar="RUN", required=True, help="folder of the run")
