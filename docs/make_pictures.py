@@ -42,7 +42,7 @@ PLOTLY = re.compile(r"<script>/\*\*\s*\* plotly\.js.*?</script>", re.DOTALL)
 GIF = "fps=15,scale=240:-1:flags=lanczos,split[a][b];[a]palettegen=max_colors=64[p];[b][p]paletteuse=dither=none"
 PLAY = "play --task Pendulum --checkpoint best --video"
 LOOP = "main --task Pendulum"
-DIAGNOSIS = "diagnose --task Pendulum --data motion --out found"
+DIAGNOSIS = "diagnose --task Pendulum --data motion --accuracy 5% --out found"
 EFFECTS = "coulomb_friction,viscous_friction,actuator_gain,actuator_delay,joint_offset"
 DARK = [(40, 42, 46), (179, 38, 30), (46, 125, 50), (160, 106, 0), (21, 101, 192), (123, 31, 162), (0, 121, 107)]
 THEME = TerminalTheme((250, 250, 248), (40, 42, 46), [*DARK, (110, 110, 110)], [(110, 110, 110), *DARK[1:], DARK[0]])

@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
-from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, spelt, titled
+from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
 from bayessim_mjx.diagnosis.phrases.verdict import number as noise_sd
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.diagnosis.statistics import of_one
+from bayessim_mjx.effects.support.words import spelt
 from bayessim_mjx.quantities import count, finite
 from bayessim_mjx.report import gap_figures, horizon_figures, marks, place_figures
 from bayessim_mjx.report.choice import choice

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +11,9 @@ from scipy.special import ndtri
 from bayessim_mjx import effects as library
 from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.correction import Estimate, FoundEffect
+from bayessim_mjx.diagnosis.data_sheet import ACCURACY
 from bayessim_mjx.diagnosis.selection.numbers import ODDS
-from bayessim_mjx.effects.support.words import words
+from bayessim_mjx.effects.support.words import spelt, words
 from bayessim_mjx.quantities import MOST, finite, listed, percent
 
 if TYPE_CHECKING:
@@ -99,11 +99,6 @@ def quantity(name: str, value: Estimate) -> tuple[str, str]:
         turned = {"at least": "at most", "at most": "at least"}.get(value.bound, value.bound)
         return RECIPROCALS[name], _bounded(measured(1 / value.mean, sd, _turned(value.unit)), turned)
     return spelt(name), _bounded(measured(value.mean, value.sd, value.unit), value.bound)
-
-
-def spelt(name: str) -> str:
-    """Return a parameter's name in words: `com_x` -> `centre of mass x`."""
-    return re.sub(r"^com ", "centre of mass ", name.replace("_", " "))
 
 
 def _bounded(text: str, bound: str) -> str:
@@ -299,6 +294,19 @@ def moves(spread: float, groups: int, blocks: bool = False) -> str:
 def far_from_data_sheet(value: float, away: float) -> str:
     """Of a known parameter whose accuracy was stated."""
     return f"is {value:.4g}, {away:.1f} sd from the data sheet"
+
+
+def far_from_model(known: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a sentence on known parameters clearly off the model's value, by more than a usual data sheet's error.
+
+    Without it a headline names an effect, and hides that the same fit needs a link with half as much mass again.
+    """
+    far = []
+    for name, p in known.items():
+        away, sd = abs(p["mean"] - p["nominal"]), p.get("sd")
+        if finite(sd) and away > CLEAR * max(sd, ACCURACY * abs(p["nominal"])):
+            far.append(f"{name} is {measured(p['mean'], sd)}, not {p['nominal']:.4g}")
+    return [f"In this fit, {listed(far, most=3)}."] if far else []
 
 
 def less_accurate(found: Mapping[str, tuple[float, float, float]]) -> str:

@@ -11,8 +11,9 @@ from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Look
 from bayessim_mjx.diagnosis.equation_error.search import Proposal
 from bayessim_mjx.diagnosis.logcheck.drives import LEAST
 from bayessim_mjx.diagnosis.logcheck.links import Channel
-from bayessim_mjx.diagnosis.phrases.effects import CLEAR, any_of, measured, multiplied, spelt, titled
+from bayessim_mjx.diagnosis.phrases.effects import CLEAR, any_of, measured, multiplied, titled
 from bayessim_mjx.diagnosis.request import Tolerance
+from bayessim_mjx.effects.support.words import spelt
 from bayessim_mjx.odometry.base import Base
 from bayessim_mjx.odometry.stand import Stand
 from bayessim_mjx.quantities import EXACT, MOST, estimate, extent, finite, listed, number, percent

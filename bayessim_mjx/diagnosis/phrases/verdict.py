@@ -9,7 +9,7 @@ from typing import Any
 from bayessim_mjx.diagnosis.phrases import effects, residual
 from bayessim_mjx.diagnosis.phrases import effects as named
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
-from bayessim_mjx.diagnosis.selection.numbers import ODDS
+from bayessim_mjx.diagnosis.selection.numbers import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
 from bayessim_mjx.quantities import MOST, extent, finite, listed, percent
 
@@ -112,7 +112,8 @@ def _head(d: Diagnosis) -> str:
     open_ = [named.answer(e, several[label]) for e in d.effects if (label := f"{e.name}@{e.where}") in several]
     sure = [e for e in d.effects if f"{e.name}@{e.where}" not in several]
     parts = [named.capital(named.lacking(sure)) + "."] if sure else []
-    return " ".join([*parts, *open_, *([REST.format(**fill)] if far.beyond else [])])
+    parts += [*open_, *(effects.far_from_model(d.parameters) if d.accuracy else ())]
+    return " ".join([*parts, *([REST.format(**fill)] if far.beyond else [])])
 
 
 def _fill(d: Diagnosis) -> dict[str, str]:
@@ -293,7 +294,7 @@ def horizon_warning(far: Gap) -> list[str]:
     """Warn of a share closed that changes with the horizon: of one horizon its interval lies above another's."""
     loud = [row for row in far.horizons if not of_one(row["calibrated"] ** 2).at_noise]
     ends = [[of_rms(row["calibrated"], level).closed for level in row["ci"]["with_effects"]] for row in loud]
-    differ = len(loud) > 1 and max(least for _, least in ends) > min(most for most, _ in ends)
+    differ = len(loud) > 1 and max(least for _, least in ends) > min(most for most, _ in ends) + RELEVANCE.share
     closed = {row["name"]: of_rms(row["calibrated"], row["with_effects"]).closed for row in loud}
     each = [f"{percent(share) if share > 0 else 'none'} ({name})" for name, share in closed.items()]
     return [f"the share of the gap that is closed depends on the horizon: {', '.join(each)}"] if differ else []

@@ -25,6 +25,7 @@ from bayessim_mjx.diagnosis.selection import bounds, heldout
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.effects.support.actuators import OfGains, OfLoops
+from bayessim_mjx.effects.support.words import spelt
 
 Array = NDArray[np.float64]
 
@@ -137,7 +138,7 @@ def _effect(found: Findings, effect: Candidate, sd: Array, part: dict[str, Any])
             if deviation > UNIFORM * (c.high - c.low)
             else ""
         )
-        ends += [f"{phrases.spelt(word)} {clause}"] if clause else []
+        ends += [f"{spelt(word)} {clause}"] if clause else []
     shared = _shared(effect, size_of(effect, model.fit.values[own], sd[own]), weighed, weights)
     return FoundEffect(
         name=effect.effect,

@@ -90,6 +90,8 @@ def every():
     moves = {"mean": 1.0, "structural": effects.moves(0.2, 3), "at_bound": False, "data_sheet": ""}
     same = {"mean": 1.0, "structural": "", "data_sheet": "", "same_as": ["viscous_friction@hinge"]}
     known = {"hip": stuck, "knee": stuck, "arm": far, "leg": far, "foot": moves, "toe": same}
+    plain = {"structural": "", "data_sheet": "", "nominal": 1.0}
+    heavier = {"arm_mass_mult": plain | {"mean": 1.43, "sd": 0.022}, "leg_mass_mult": plain | {"mean": 1.1, "sd": 0.01}}
     few = {"hip": stuck, "arm": far}
     short = {"minutes": 5.0, "before": 2.0, "parts": ["3 pairs"]}
     chance = {"answer": 0.9, "rivals": 0.08, "nothing": 1e-9}
@@ -122,6 +124,7 @@ def every():
         ),
         "beside joints that keep their speed": made("unexplained", [GAIN], gap(with_effects=6.0, coasting=5.0)),
         "known parameters": made("effects", [FRICTION], parameters=known, builds_up=3.0),
+        "a heavier link": made("effects", [FRICTION], parameters=heavier, accuracy={"mass": {"low": 0.15}}),
         "one parameter": made("effects", [FRICTION], parameters=few, efforts="the motors follow"),
     }  # fmt: skip
 

@@ -141,10 +141,11 @@ def _sizes(said: Said) -> Iterator[tuple[str, str]]:
             known.append((p["mean"], p["sd"]))
             if name.startswith(("inverse", "slowness")) and p["mean"]:
                 known.append((1 / p["mean"], p["sd"] and p["sd"] / p["mean"] ** 2))
+    known += [(p["mean"], p["sd"]) for p in said["parameters"].values() if "sd" in p]
     for mean, sd, unit in re.findall(rf"({NUMBER}) \+- ({NUMBER}) ?(ms)?", text_of(said)):
         scale = IN_UNIT.get(unit, 1.0)
         if not any(rounds_to(m, mean, scale) and rounds_to(s, sd, scale) for m, s in known):
-            yield "size", f"{mean} +- {sd} {unit} is no effect's number".replace("  ", " ")
+            yield "size", f"{mean} +- {sd} {unit} is no effect's or parameter's number".replace("  ", " ")
 
 
 def _intervals(said: Said) -> Iterator[tuple[str, str]]:

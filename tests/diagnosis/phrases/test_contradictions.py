@@ -35,6 +35,7 @@ def test_no_made_up_result_contradicts_itself(name):
         ("one effect", "1.1 % of the motion", "3.3 % of the motion", "source"),
         ("one effect", "0.1497 +- 0.0087", "0.1697 +- 0.0087", "size"),
         ("one effect", "+- 0.0087", "+- 0.0037", "size"),
+        ("a heavier link", "1.430 +- 0.022", "1.130 +- 0.022", "size"),
         ("one effect", "0.61 deg", "0.71 deg", "size"),
         ("one effect", "10.7 noise sd", "12.7 noise sd", "size"),
         ("a class with a number", "12.0 ms", "15.0 ms", "interval"),
