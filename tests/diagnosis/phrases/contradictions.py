@@ -139,6 +139,7 @@ def _sizes(said: Said) -> Iterator[tuple[str, str]]:
     for e in said["effects"]:
         for name, p in e["parameters"].items():
             known.append((p["mean"], p["sd"]))
+            known += [(p["mean"] * m, p["sd"] and p["sd"] * m) for m in (e.get("modelled") or {}).values()]
             if name.startswith(("inverse", "slowness")) and p["mean"]:
                 known.append((1 / p["mean"], p["sd"] and p["sd"] / p["mean"] ** 2))
     known += [(p["mean"], p["sd"]) for p in said["parameters"].values() if "sd" in p]
