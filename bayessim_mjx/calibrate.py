@@ -39,7 +39,7 @@ def _parser() -> cli.PlainParser:
     tests.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed")
     parser.trusting("test")
     computing.add_argument("--device", metavar="NAME", help="auto, cpu or gpu (default: that of the run)")
-    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"
+    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE, else ~/.cache/bayessim_mjx)"
     computing.add_argument("--cache_dir", metavar="DIR", help=text)
     return parser
 

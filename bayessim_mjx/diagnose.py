@@ -48,7 +48,7 @@ def _parser() -> cli.PlainParser:
     _output(parser.group("output"))
     computing = parser.group("computing")
     computing.add_argument("--device", metavar="NAME", default="auto", help="auto, cpu or gpu")
-    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"
+    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE, else ~/.cache/bayessim_mjx)"
     computing.add_argument("--cache_dir", metavar="DIR", help=text)
     return parser
 

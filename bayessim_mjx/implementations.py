@@ -41,7 +41,7 @@ def _parser() -> cli.PlainParser:
     text = "remove the task's measurements, and stop"
     measured.add_argument("--forget", action="store_true", help=text)
     computing.add_argument("--device", metavar="NAME", help="auto, cpu, gpu, gpu:1 or cuda:0 (default: auto)")
-    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"
+    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE, else ~/.cache/bayessim_mjx)"
     computing.add_argument("--cache_dir", metavar="DIR", help=text)
     parser.group("output").add_argument("--headless", action="store_true", help="plain lines, without colours")
     return parser

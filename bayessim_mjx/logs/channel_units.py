@@ -11,7 +11,7 @@ EFFORTS = {"rad": "N m", "m": "N"}
 
 
 def units_of(model: mujoco.MjModel) -> dict[str, str]:
-    """{`qpos:elbow`: "rad"} of positions, velocities, efforts and commands; those without an entry have none."""
+    """{`qpos:elbow`: "rad"} of positions, velocities and commands. Efforts are logged in any unit, and have none."""
     names, found = Channels.of(model), dict[str, str]()
     for joint, kind in zip(names.joints, names.kinds, strict=True):
         own = {"slide": ["m"], "hinge": ["rad"], "ball": ["rad"] * 3}.get(kind, ["m"] * 3 + ["rad"] * 3)
@@ -25,8 +25,7 @@ def units_of(model: mujoco.MjModel) -> dict[str, str]:
         length = found.get(f"qpos:{joint}")
         if length is None:
             continue
-        effort = EFFORTS[length]
-        found |= {f"effort:{name}": effort, f"effort:{joint}": effort, f"ctrl:{name}": _command(model, i, length)}
+        found[f"ctrl:{name}"] = _command(model, i, length)
     return {channel: unit for channel, unit in found.items() if unit}
 
 
