@@ -199,9 +199,10 @@ def _diagnose(argv: Sequence[str] | None) -> int:
 def _told(title: str, lines: Sequence[str], headless: bool) -> None:
     """Print a list as soon as it is known, such as what the logs show before anything is simulated."""
     from bayessim_mjx.monitor.output import Output
+    from bayessim_mjx.report.words import signs
 
     out = Output(headless, sys.stdout)
-    print(title, *(part for line in lines for part in out.broken(f"  {line}", 4)), sep="\n", flush=True)
+    print(title, *(part for line in lines for part in out.broken(f"  {signs(line)}", 4)), sep="\n", flush=True)
 
 
 main = cli.command(_diagnose)
