@@ -10,6 +10,7 @@ from bayessim_mjx.report.look import (
     FAINT,
     HATCH,
     INK,
+    NARROW,
     OVER,
     STAGE,
     WIDTH,
@@ -28,8 +29,7 @@ PARTS = {
     "noise_floor": "not explained",
 }
 FLOORS = {"repeats": "differs between repeats", "start": "uncertain start"}  # what lies between floor and noise
-TICKS = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
-NARROW = 320  # px, of a phone
+TICKS = [0.0, 0.5, 1.0]  # few enough for a phone
 HIGHEST = 1.6  # of the largest squared gap: where the picture ends, intervals with it
 STEPS = ("nominal", "calibrated", "with_effects")
 
@@ -102,6 +102,7 @@ def waterfall(
             "squared gap, share of the largest",
             tickvals=TICKS,
             tickformat=".0%",
+            tickangle=0,
             range=[0, max(1.0, *ends) * (1 + 0.035 * longest)],
         ),
         yaxis=axis(

@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bayessim_mjx.report.gap_figures import FLOORS, NARROW, PARTS, above, part_words, squares
-from bayessim_mjx.report.look import HATCH, INK, OVER, STAGE, WIDTH, axis, figure, text
+from bayessim_mjx.report.gap_figures import FLOORS, PARTS, above, part_words, squares
+from bayessim_mjx.report.look import HATCH, INK, NARROW, OVER, STAGE, WIDTH, axis, figure, text
 from bayessim_mjx.report.words import percent
 
 
