@@ -8,6 +8,7 @@ from typing import Any
 
 from bayessim_mjx.diagnosis.phrases import effects, residual
 from bayessim_mjx.diagnosis.phrases import effects as named
+from bayessim_mjx.diagnosis.residual.regions import MENTIONED
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.numbers import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
@@ -25,6 +26,10 @@ PARTLY_HEAD = "Partly explained: {named}."
 PART = "The library explains only a part of the gap that recalibration leaves, {calibrated}."
 REST = "More than the tolerance remains at {beyond}."
 IMPERFECT = "No candidate closes the rest, {rest} of the squared gap: the law is not quite that of the real system."
+LEFT = (
+    "Of the squared gap above the noise {they} {leave} {rest}. The cause of this rest is unknown; it is within the "
+    "tolerance."
+)
 NEAREST = "Nearest effects of the library: {nearest}."
 LITTLE = "At most half is closed: {they} {explain} little of the gap."
 ON_TOP = "Beside {them} a force is missing: that force makes {remains} of the squared gap."
@@ -132,6 +137,7 @@ def _fill(d: Diagnosis) -> dict[str, str]:
         "shown": percent(of_rms(far.calibrated, far.with_effects).closed),
         "nested": "Chosen and fitted" if far.closed.get("nested") else "Fitted",
         "close": "closes" if one else "close",
+        "leave": "leaves" if one else "leave",
         "rest": percent(of_rms(far.calibrated, far.with_effects).left),
         **{k: percent(far.closed.get(k)) for k in ("predicted", "realised", "elsewhere")},
     }
@@ -150,6 +156,8 @@ def _how_far(d: Diagnosis) -> list[str]:
             remains = basis.get("remains") or 0.0
             out += [ON_TOP.replace("{remains}", percent(remains))] if remains > 0 else []
         out += [IMPERFECT] if far.beyond and d.verdict != "unexplained" and left > 0 else []
+        loud = left > MENTIONED and not of_one(far.with_effects**2).at_noise
+        out += [LEFT] if loud and not far.beyond and d.verdict != "unexplained" else []
         out += [PROMISED] if finite(far.closed.get("realised")) else []
         out += [ELSEWHERE] if finite(far.closed.get("elsewhere")) else []
     out += [IN_SAMPLE] if far.in_sample else []

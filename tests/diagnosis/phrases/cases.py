@@ -108,6 +108,7 @@ def every():
         "one law at two joints": made("effects", [FRICTION, dataclasses.replace(FRICTION, where="elbow")]),
         "one log": made("effects", [FRICTION], gap(closed=ALONE, in_sample=True)),
         "a remainder": made("effects", [FRICTION], some),
+        "much is left within the tolerance": made("ambiguous", [FRICTION, PAYLOAD], gap(with_effects=6.0)),
         "an effect at its bound": made(
             "effects",
             [dataclasses.replace(END, sentence="Gap ends.")],

@@ -109,6 +109,8 @@ def _quoted(said: Said) -> Iterator[tuple[str, str]]:
         "leaves it out, the effect closes": [closed.get("elsewhere")],
         "leaves it out, the effects close": [closed.get("elsewhere")],
         r"closes the rest,": [1.0 - sheet["effects"]],
+        "the effect leaves": [1.0 - sheet["effects"]],
+        "the effects leave": [1.0 - sheet["effects"]],
         r"that force makes": [basis.get("remains")],
         "among all fitted explanations:": [chance.get("answer")],
         "for this one,": [chance.get("rivals")],
@@ -191,7 +193,7 @@ def _verdict(said: Said) -> Iterator[tuple[str, str]]:
         yield "words", f"no gap above the noise, but {gap['nominal']:.2f} noise sd"
     left = 1.0 - share(*_falls(said)["effects"])
     open_ = name in ("effects", "ambiguous") and left > UNEXPLAINED and gap["with_effects"] > 1.2
-    if open_ and "covariance of" not in text:
+    if open_ and "covariance of" not in text and "cause of this rest is unknown" not in text:
         yield (
             "verdict",
             f"verdict {name}, but the effects leave {left:.0%} of the gap, {gap['with_effects']:.2f} noise sd",

@@ -29,6 +29,8 @@ def test_no_made_up_result_contradicts_itself(name):
         ("one effect", "in turn, the effect closes 98 %", "in turn, the effect closes 66 %", "share"),
         ("one effect", "explanations: 90 %", "explanations: 8.0 %", "share"),
         ("a remainder", "closes the rest, 7.0 %", "closes the rest, 66 %", "share"),
+        ("much is left within the tolerance", "effects leave 31 %", "effects leave 3.0 %", "share"),
+        ("much is left within the tolerance", "cause of this rest is unknown", "", "verdict"),
         ("partly", "that force makes 20 %", "that force makes 80 %", "share"),
         ("partly", "force removes 75 %", "force removes 20 %", "share"),
         ("one effect", "2.1 %", "2.3 %", None),  # is quoted nowhere
