@@ -8,6 +8,7 @@ from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
 from bayessim_mjx.diagnosis.phrases.verdict import number as noise_sd
+from bayessim_mjx.diagnosis.phrases.verdict import with_effects
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.diagnosis.statistics import of_one
 from bayessim_mjx.effects.support.words import spelt
@@ -39,7 +40,7 @@ EFFECTS = STAGE["with_effects"]
 TILES = {
     "nominal": "as delivered",
     "calibrated": "after recalibration",
-    "with_effects": "with the effects",
+    "with_effects": "",  # `with_effects`
 }
 
 
@@ -54,7 +55,7 @@ def top(d: Diagnosis, folder: Path) -> dict[str, Any]:
         "sentences": parted(d)[0],
         "advice": verdict.advice,
         "command": command(d, folder),
-        "tiles": [{"words": TILES[s], "colour": STAGE[s], **_tile(d, s)} for s in shown],
+        "tiles": [{"words": TILES.get(s) or with_effects(d), "colour": STAGE[s], **_tile(d, s)} for s in shown],
         "warnings": len(d.warnings),
         "open": len(d.warnings) <= OPEN_WARNINGS,
     }

@@ -70,7 +70,7 @@ def _tables(out: Console, d: Diagnosis, tables: tuple[Callable[[Diagnosis], Tabl
 
 def _first(d: Diagnosis) -> list[tuple[str, str]]:
     """Lines of (text, style) that a person sees first; the same order as on the page."""
-    lines = [(headline(d), "bold"), (gap_line(d.gap, bool(d.effects)), ""), (verdict_of(d).advice, "dim")]
+    lines = [(headline(d), "bold"), (gap_line(d), ""), (verdict_of(d).advice, "dim")]
     return [(signs(text), style) for text, style in lines if text]
 
 

@@ -135,6 +135,6 @@ def between(low: Any, high: Any) -> str:
         return "not determined"
     ends = [percent(low), percent(high)]
     if ends[0] == ends[1] and low < high:
-        places = 1 - quantities.power(100 * (high - low))
+        places = min(1 - quantities.power(100 * (high - low)), 2)
         ends = [f"{quantities.fixed(100 * end, places)} %" for end in (low, high)]
-    return " – ".join(ends)
+    return " – ".join(dict.fromkeys(ends))  # one number where two decimals do not separate them

@@ -13,6 +13,9 @@ from bayessim_mjx.diagnosis.logcheck.drives import LEAST
 from bayessim_mjx.diagnosis.logcheck.links import Channel
 from bayessim_mjx.diagnosis.phrases.effects import CLEAR, any_of, measured, multiplied, titled
 from bayessim_mjx.diagnosis.request import Tolerance
+from bayessim_mjx.diagnosis.result import Gap
+from bayessim_mjx.diagnosis.selection.numbers import RELEVANCE
+from bayessim_mjx.diagnosis.statistics import of_one, of_rms
 from bayessim_mjx.effects.support.words import spelt
 from bayessim_mjx.odometry.base import Base
 from bayessim_mjx.odometry.stand import Stand
@@ -111,6 +114,16 @@ def whole_logs(
         text = f"{seen} of {len(names)} whole logs are simulated with parameters fitted to them"
         out.append(f"{text}: these errors are in sample")
     return out
+
+
+def horizon_warning(far: Gap) -> list[str]:
+    """Warn of a share closed that changes with the horizon: of one horizon its interval lies above another's."""
+    loud = [row for row in far.horizons if not of_one(row["calibrated"] ** 2).at_noise]
+    ends = [[of_rms(row["calibrated"], level).closed for level in row["ci"]["with_effects"]] for row in loud]
+    differ = len(loud) > 1 and max(least for _, least in ends) > min(most for most, _ in ends) + RELEVANCE.share
+    closed = {row["name"]: of_rms(row["calibrated"], row["with_effects"]).closed for row in loud}
+    each = [f"{percent(share) if share > 0 else 'none'} ({name})" for name, share in closed.items()]
+    return [f"the share of the gap that is closed depends on the horizon: {', '.join(each)}"] if differ else []
 
 
 def _some(few: Sequence[str], names: Sequence[str]) -> str:

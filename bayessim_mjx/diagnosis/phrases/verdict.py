@@ -6,14 +6,14 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from bayessim_mjx.diagnosis.phrases import effects, residual
 from bayessim_mjx.diagnosis.phrases import effects as named
-from bayessim_mjx.diagnosis.residual.regions import MENTIONED
+from bayessim_mjx.diagnosis.phrases import parameters, residual
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.numbers import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
 from bayessim_mjx.quantities import MOST, extent, finite, listed, percent
 
+SHARES = ("predicted", "realised", "elsewhere")  # of `Gap.closed`; effects that widen the gap close none
 HEADS = {
     "no_gap": "No gap above the noise: the logs differ from the simulator by {nominal}.",
     "parameters": "Only parameters are off: recalibration reduces the gap from {nominal} to {calibrated}.",
@@ -96,7 +96,7 @@ def sentences(d: Diagnosis) -> list[str]:
     if basis.get("efforts"):
         texts.append(f"By the logged efforts alone, {basis['efforts']}.")
     texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
-    texts += effects.remarks(d.parameters)
+    texts += parameters.remarks(d.parameters)
     texts += [named.not_on_offer(basis["tried"])] if d.verdict == "unexplained" and basis.get("tried") else []
     return [text for text in [*texts, not_tried(basis.get("not_tried"))] if text]
 
@@ -117,7 +117,7 @@ def _head(d: Diagnosis) -> str:
     open_ = [named.answer(e, several[label]) for e in d.effects if (label := f"{e.name}@{e.where}") in several]
     sure = [e for e in d.effects if f"{e.name}@{e.where}" not in several]
     parts = [named.capital(named.lacking(sure)) + "."] if sure else []
-    parts += [*open_, *(effects.far_from_model(d.parameters) if d.accuracy else ())]
+    parts += [*open_, *(parameters.far_from_model(d.parameters) if d.accuracy else ())]
     return " ".join([*parts, *([REST.format(**fill)] if far.beyond else [])])
 
 
@@ -139,7 +139,7 @@ def _fill(d: Diagnosis) -> dict[str, str]:
         "close": "closes" if one else "close",
         "leave": "leaves" if one else "leave",
         "rest": percent(of_rms(far.calibrated, far.with_effects).left),
-        **{k: percent(far.closed.get(k)) for k in ("predicted", "realised", "elsewhere")},
+        **{k: percent(max(v, 0.0)) for k, v in far.closed.items() if k in SHARES and finite(v)},
     }
 
 
@@ -156,7 +156,7 @@ def _how_far(d: Diagnosis) -> list[str]:
             remains = basis.get("remains") or 0.0
             out += [ON_TOP.replace("{remains}", percent(remains))] if remains > 0 else []
         out += [IMPERFECT] if far.beyond and d.verdict != "unexplained" and left > 0 else []
-        loud = left > MENTIONED and not of_one(far.with_effects**2).at_noise
+        loud = left > RELEVANCE.share and not of_one(far.with_effects**2).at_noise
         out += [LEFT] if loud and not far.beyond and d.verdict != "unexplained" else []
         out += [PROMISED] if finite(far.closed.get("realised")) else []
         out += [ELSEWHERE] if finite(far.closed.get("elsewhere")) else []
@@ -245,11 +245,16 @@ def stage(far: Gap, name: str) -> str:
     return f"{parts[0]} ({noises})" if parts else noises
 
 
-def gap_line(far: Gap, effects: bool) -> str:
+def gap_line(d: Diagnosis) -> str:
     """Return the three gap numbers on one line of the terminal (the page has tiles, `report.sections`)."""
-    words = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
-    known = [s for s in words if finite(getattr(far, s)) and (effects or s != "with_effects")]
-    return "Gap: " + ", ".join(f"{stage(far, s)} {words[s]}" for s in known) + "." if known else ""
+    words = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": with_effects(d)}
+    known = [s for s in words if finite(getattr(d.gap, s)) and (d.effects or s != "with_effects")]
+    return "Gap: " + ", ".join(f"{stage(d.gap, s)} {words[s]}" for s in known) + "." if known else ""
+
+
+def with_effects(d: Diagnosis) -> str:
+    """Name the stage with the effects: in a headline that names none they are the nearest ones."""
+    return "with the nearest effects" if d.verdict == "unexplained" and not d.gap.beyond else "with the effects"
 
 
 def _worst(far: Gap) -> list[str]:
@@ -296,13 +301,3 @@ def _by_joint(far: Gap, effects: bool) -> str:
 def number(value: float) -> str:
     """Three digits, in plain notation."""
     return f"{value:.2f}" if value < 9.995 else f"{value:.1f}" if value < 99.95 else f"{value:.0f}"
-
-
-def horizon_warning(far: Gap) -> list[str]:
-    """Warn of a share closed that changes with the horizon: of one horizon its interval lies above another's."""
-    loud = [row for row in far.horizons if not of_one(row["calibrated"] ** 2).at_noise]
-    ends = [[of_rms(row["calibrated"], level).closed for level in row["ci"]["with_effects"]] for row in loud]
-    differ = len(loud) > 1 and max(least for _, least in ends) > min(most for most, _ in ends) + RELEVANCE.share
-    closed = {row["name"]: of_rms(row["calibrated"], row["with_effects"]).closed for row in loud}
-    each = [f"{percent(share) if share > 0 else 'none'} ({name})" for name, share in closed.items()]
-    return [f"the share of the gap that is closed depends on the horizon: {', '.join(each)}"] if differ else []

@@ -18,7 +18,7 @@ from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.phrases import effects as phrases
-from bayessim_mjx.diagnosis.phrases import effects as remarks
+from bayessim_mjx.diagnosis.phrases import parameters as remarks
 from bayessim_mjx.diagnosis.phrases.effects import CLEAR
 from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.selection import bounds, heldout

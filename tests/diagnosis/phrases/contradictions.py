@@ -101,7 +101,8 @@ def _quoted(said: Said) -> Iterator[tuple[str, str]]:
     """Shares whose datum is known, and others, which must be some number of the result."""
     gap, basis, chance = said["gap"], said.get("basis") or {}, (said.get("basis") or {}).get("probability") or {}
     held = [h["closed"] for h in ((basis.get("flexible") or {}).get("held") or {}).values()]
-    closed, sheet = gap.get("closed") or {}, {k: share(*v) for k, v in _falls(said).items()}
+    shares = {k: max(v, 0.0) for k, v in (gap.get("closed") or {}).items() if isinstance(v, float)}
+    closed, sheet = shares, {k: share(*v) for k, v in _falls(said).items()}
     exact = {
         r"linear step predicted": [closed.get("predicted")],
         "in turn, the effect closes": [closed.get("realised")],
