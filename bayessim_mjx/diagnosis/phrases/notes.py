@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -114,6 +115,15 @@ def whole_logs(
         text = f"{seen} of {len(names)} whole logs are simulated with parameters fitted to them"
         out.append(f"{text}: these errors are in sample")
     return out
+
+
+def not_tried(short: Mapping[str, Any] | None) -> str:
+    """Parts of the search that the time was too short for."""
+    if not short:
+        return ""
+    text = f"In {short['minutes']:.3g} minutes not everything was tried: no time for {listed(short['parts'])}."
+    before = f" Before the search, reading the logs and compiling took {short['before']:.2g} of them."
+    return text + before * bool(short["before"])
 
 
 def horizon_warning(far: Gap) -> list[str]:

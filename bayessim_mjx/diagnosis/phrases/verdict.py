@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from bayessim_mjx.diagnosis.phrases import effects as named
-from bayessim_mjx.diagnosis.phrases import parameters, residual
+from bayessim_mjx.diagnosis.phrases import notes, parameters, residual
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.numbers import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
@@ -84,10 +84,9 @@ def sentences(d: Diagnosis) -> list[str]:
     texts = [_head(d), *_how_far(d), *_doubts(d), coasting(far, bool(d.effects)), _probable(d), _behind(d)]
     ambiguous = [found for found in d.answers if len(found["members"]) > 1]
     texts += [SPLITS.format(name=d.next_experiment["name"])] if any(a["splits"] for a in ambiguous) else []
-    them = "it" if len(d.effects) == 1 else "them"
     members = {label for a in d.answers for m in a["members"] for label in m["effects"]}
     hidden = [label for label in d.hidden if label not in members]  # a class already says that they are not separated
-    their = "its" if len(d.effects) == 1 else "their"
+    them, their = ("it", "its") if len(d.effects) == 1 else ("them", "their")
     texts += [HIDDEN.format(them=them, their=their, hidden=named.any_of(hidden, MOST))] if hidden else []
     texts += _noise(d)
     if d.verdict == "unexplained" and basis.get("flexible"):
@@ -98,7 +97,7 @@ def sentences(d: Diagnosis) -> list[str]:
     texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
     texts += parameters.remarks(d.parameters)
     texts += [named.not_on_offer(basis["tried"])] if d.verdict == "unexplained" and basis.get("tried") else []
-    return [text for text in [*texts, not_tried(basis.get("not_tried"))] if text]
+    return [text for text in [*texts, notes.not_tried(basis.get("not_tried"))] if text]
 
 
 def _head(d: Diagnosis) -> str:
@@ -108,17 +107,24 @@ def _head(d: Diagnosis) -> str:
         quoted = {"no_gap": far.nominal, "parameters": far.calibrated}.get(d.verdict)
         above = quoted is not None and not of_one(quoted**2).at_noise
         head = HEADS["no_gap"].partition(": ")[2] if above and d.verdict == "no_gap" else HEADS[d.verdict]
-        return named.capital((head + SMALL * above).format(**fill))
+        return named.capital((head + SMALL * above).format(**fill)) + _acts(d)
     if d.verdict == "unexplained":
         gap = of_rms(far.calibrated, far.with_effects)
         head = f"{PARTLY_HEAD} {REST}" if far.beyond else PART if gap.closed > gap.left else HEADS["unexplained"]
-        return head.format(named=named.lacking(d.effects), **fill)
+        return head.format(named=named.lacking(d.effects), **fill) + _acts(d)
     several = {a["effect"]: a for a in d.answers if len(a["members"]) > 1}
     open_ = [named.answer(e, several[label]) for e in d.effects if (label := f"{e.name}@{e.where}") in several]
     sure = [e for e in d.effects if f"{e.name}@{e.where}" not in several]
     parts = [named.capital(named.lacking(sure)) + "."] if sure else []
     parts += [*open_, *(parameters.far_from_model(d.parameters) if d.accuracy else ())]
     return " ".join([*parts, *([REST.format(**fill)] if far.beyond else [])])
+
+
+def _acts(d: Diagnosis) -> str:
+    """Return the place of a force that is missing beside all effects; "" where none predicts the residual."""
+    force = d.basis.get("flexible") or {}
+    known = d.verdict == "unexplained" and force.get("joints") and residual.predicts(force)
+    return f" A force is missing at {listed(force['joints'], most=3)}." if known else ""
 
 
 def _fill(d: Diagnosis) -> dict[str, str]:
@@ -218,15 +224,6 @@ def coasting(far: Gap, named: bool) -> str:
     closed = of_rms(far.coasting, far.with_effects).closed
     more = COASTS_CLOSED.format(closed=percent(max(closed, 0.0))) if named and finite(closed) else ""
     return COASTS.format(coasting=number(far.coasting), calibrated=number(far.calibrated), more=more)
-
-
-def not_tried(short: Mapping[str, Any] | None) -> str:
-    """Parts of the search that the time was too short for."""
-    if not short:
-        return ""
-    text = f"In {short['minutes']:.3g} minutes not everything was tried: no time for {listed(short['parts'])}."
-    before = f" Before the search, reading the logs and compiling took {short['before']:.2g} of them."
-    return text + before * bool(short["before"])
 
 
 def _at_bound(effect: FoundEffect) -> bool:
