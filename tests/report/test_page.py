@@ -283,3 +283,10 @@ def test_a_verdict_has_the_colour_of_the_terminal(verdict, tmp_path):
     assert f"--tone: {on_page};" in report.write(fake.bare(verdict), tmp_path).read_text(encoding="utf-8")
     others = [page for terminal, page in TONES.values() if terminal == on_terminal]
     assert set(others) == {on_page}
+
+
+def test_a_robot_of_one_joint_has_no_table_of_shares(tmp_path):
+    """`hinge 100 % (100 % - 100 %)` says nothing."""
+    whole = fake.full()
+    page = rendered(dataclasses.replace(whole, where=whole.where[:1]), tmp_path)
+    assert f"All of it is at {whole.where[0].channel}" in page.text and "share of the squared gap" not in page.text
