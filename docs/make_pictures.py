@@ -196,7 +196,9 @@ def diagnosis_pictures(work: Path, out: Path) -> None:
     subprocess.run(command, check=True, capture_output=True)
     from PIL import Image
 
-    Image.open(picture).convert("RGB").quantize(128).save(picture, optimize=True)  # text and bars: few colours
+    # text and bars have few colours; a median cut loses those of small squares
+    few = Image.open(picture).convert("RGB").quantize(128, method=Image.Quantize.MAXCOVERAGE)
+    few.save(picture, optimize=True)
 
 
 PICTURES = {"loop": loop_pictures, "diagnosis": diagnosis_pictures}
