@@ -105,9 +105,10 @@ class Bars:
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
         if stage not in self.stages:
-            for other in self.stages.values():
-                known = self.bars.tasks[other].total or 1
-                self.bars.update(other, completed=known, total=known)
+            for other in (k for k in self.stages.values() if not self.bars.tasks[k].finished):
+                known = self.bars.tasks[other].total
+                whole = {"count": f"{known:.0f}/{known:.0f}"} if known else {}
+                self.bars.update(other, completed=known or 1, total=known or 1, **whole)
             self.stages[stage] = self.bars.add_task(stage, total=None, count="")
         shown, room = f"{stage}, {note}" if note else stage, max(self.bars.console.width - BESIDE, 20)
         shown = shown if len(shown) <= room else f"{shown[: room - 1]}…"

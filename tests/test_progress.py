@@ -126,3 +126,18 @@ def test_a_long_stage_leaves_room_for_its_bar(width, monkeypatch):
         show.bars.refresh()
     text = sys.stderr.getvalue()
     assert "…" in text and "1/2" in text and "0:00:00" in text
+
+
+def test_a_stage_that_has_ended_is_whole(monkeypatch):
+    """Its last count was `64/67`, as counts come after batches."""
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("TERM", "xterm")
+    with progress.stages(headless=False) as show:
+        show("compiling", 0, 1)
+        show("screening", 64, 67)
+        show("single effects", 0, 3)
+        show("screening again", 0, 3)
+        counts = {task.description: task.fields["count"] for task in show.bars.tasks}
+        whole = [task.finished for task in show.bars.tasks]
+    assert counts == {"compiling": "", "screening": "67/67", "single effects": "3/3", "screening again": "0/3"}
+    assert whole == [True, True, True, False]
