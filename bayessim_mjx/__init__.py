@@ -46,6 +46,10 @@ __all__ = [
 announce()  # bayessim_mjx/<Task>-v0 in Gymnasium
 
 
+def __dir__() -> list[str]:
+    return sorted(__all__)  # what completion offers
+
+
 def __getattr__(name: str) -> Any:
     if name == "diagnose":  # the command's module, which can be called
         return import_module("bayessim_mjx.diagnose")

@@ -29,7 +29,7 @@ ADVICE = {
 
 
 def _parser() -> cli.PlainParser:
-    about = "Test a finished run's posterior on fresh simulations, and whether real motion looks like them."
+    about = "Test a finished run's posterior on fresh simulations, and compare real motion with them."
     parser = cli.PlainParser("calibrate", description=about, usage="%(prog)s --run RUN [options]")
     tests, computing = parser.group("test"), parser.group("computing")
     tests.add_argument("--run", metavar="RUN", required=True, help="folder of the run")
@@ -39,7 +39,7 @@ def _parser() -> cli.PlainParser:
     tests.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed")
     parser.trusting("test")
     computing.add_argument("--device", metavar="NAME", help="auto, cpu or gpu (default: that of the run)")
-    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"
+    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE, else ~/.cache/bayessim_mjx)"
     computing.add_argument("--cache_dir", metavar="DIR", help=text)
     return parser
 

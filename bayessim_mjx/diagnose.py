@@ -43,12 +43,12 @@ def _parser() -> cli.PlainParser:
     robot.add_argument("--map", metavar="FILE", help=text)
     text = "metadata key that names the operating condition of a log; each condition is held out in turn"
     robot.add_argument("--group", metavar="KEY", help=text)
-    _known(parser.group("what is known"))
+    _known(parser.group("known data"))
     _search(parser.group("search"))
     _output(parser.group("output"))
     computing = parser.group("computing")
     computing.add_argument("--device", metavar="NAME", default="auto", help="auto, cpu or gpu")
-    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"
+    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE, else ~/.cache/bayessim_mjx)"
     computing.add_argument("--cache_dir", metavar="DIR", help=text)
     return parser
 
@@ -62,7 +62,7 @@ def _known(group: Any) -> None:
         "the logs, one for each kind of the model's own numbers; the ranges of --parameters)"
     )
     group.add_argument("--accuracy", metavar="SHARE", nargs="+", default=[], help=text)
-    text = "what the robot is rated to carry: 12kg, or tool=12kg (default: what its drives hold, up to its weight)"
+    text = "rated payload: 12kg, or tool=12kg (default: as much as its drives hold, up to its weight)"
     group.add_argument("--payload", metavar="KG", nargs="+", default=[], help=text)
     text = (
         "what may stay unexplained at a joint: 0.5deg, 2mm, 3%% of the motion, or elbow=0.5deg for one joint "
@@ -78,7 +78,7 @@ def _search(group: Any) -> None:
         "docs/effects.md says which ones are tried only where named)"
     )
     group.add_argument("--effects", metavar="LIST", default="all", help=text)
-    text = "time that it may take: the search is cut down to it, and the result lists what was not tried"
+    text = "time limit: the search is cut down to it, and the result lists effects that were not tried"
     group.add_argument("--minutes", metavar="M", type=cli.positive("minutes"), help=f"{text} (default: no limit)")
     group.add_argument("--quick", action="store_true", help="a first answer: fewer windows and effects, no maps")
     group.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed")
@@ -199,9 +199,10 @@ def _diagnose(argv: Sequence[str] | None) -> int:
 def _told(title: str, lines: Sequence[str], headless: bool) -> None:
     """Print a list as soon as it is known, such as what the logs show before anything is simulated."""
     from bayessim_mjx.monitor.output import Output
+    from bayessim_mjx.report.words import signs
 
     out = Output(headless, sys.stdout)
-    print(title, *(part for line in lines for part in out.broken(f"  {line}", 4)), sep="\n", flush=True)
+    print(title, *(part for line in lines for part in out.broken(f"  {signs(line)}", 4)), sep="\n", flush=True)
 
 
 main = cli.command(_diagnose)

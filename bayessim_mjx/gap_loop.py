@@ -30,8 +30,8 @@ def _parser() -> cli.Parser:
     gap.add_argument("--diagnosis", metavar="DIR", help="folder that bayessim-mjx diagnose wrote")
     gap.add_argument("--parameters", metavar="FILE", help="the --parameters file that the diagnosis was given")
     text = (
-        "time step of the corrected simulator in seconds. Default: the task's, or the diagnosis' where the task's errs "
-        "by more than the tolerance"
+        "time step of the corrected simulator in seconds (default: the task's, or the diagnosis' where the task's errs "
+        "by more than the tolerance)"
     )
     gap.add_argument("--timestep", type=float, metavar="S", help=text)
     text = "logs of the real system; returns are then predicted, not measured"

@@ -38,10 +38,10 @@ def _parser() -> cli.PlainParser:
     measured.add_argument("--num_envs", metavar="N", nargs="+", type=cli.whole(1, COUNT), help=text)
     text = f"for all rollouts together, without compiling (default: {SECONDS:.0f})"
     measured.add_argument("--seconds", metavar="S", type=cli.positive("seconds"), default=SECONDS, help=text)
-    text = "remove what was measured for the task, and stop"
+    text = "remove the task's measurements, and stop"
     measured.add_argument("--forget", action="store_true", help=text)
     computing.add_argument("--device", metavar="NAME", help="auto, cpu, gpu, gpu:1 or cuda:0 (default: auto)")
-    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"
+    text = "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE, else ~/.cache/bayessim_mjx)"
     computing.add_argument("--cache_dir", metavar="DIR", help=text)
     parser.group("output").add_argument("--headless", action="store_true", help="plain lines, without colours")
     return parser

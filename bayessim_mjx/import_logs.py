@@ -79,7 +79,7 @@ def _ros(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--states", metavar="TOPIC", help="the joint states (default: the topic of that type)")
     text = "commands, for arrays with the joints in their order (default: all topics of commands)"
     parser.add_argument("--commands", metavar="TOPIC[=A,B]", nargs="+", default=[], help=text)
-    text = "what is commanded, where messages have several: position, velocity or effort"
+    text = "the commanded quantity, where messages have several: position, velocity or effort"
     parser.add_argument("--field", choices=("position", "velocity", "effort"), help=text)
     text = "which publisher of the joint states, from 1, where a refusal numbers several"
     parser.add_argument("--publisher", metavar="N", type=int, help=text)

@@ -250,8 +250,8 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     if args.hub:
         console.say(_hub(args, env, policy, config, run, returns))
     if config.monitor.video:
-        console.say("filming an episode ...")
         name = next(n for n in ("real", "posterior", "prior", "nominal") if n in chosen)
+        console.say(f"filming an episode on {KINDS[name]} ...")
         folder = (run.path if run is not None else path.parent) / "videos" / "play"
         shown = plain if name == "nominal" else env
         console.say(_video(config, shown, policy, (name, chosen[name][0]), key, folder / f"{path.name}_{name}.mp4"))

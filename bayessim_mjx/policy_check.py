@@ -81,7 +81,7 @@ def _show(result: Any) -> None:
     for entry, reason in result.untold.items():
         reasons.setdefault(reason, []).append(entry)
     for reason, entries in reasons.items():
-        console.print(f"cannot be told: {words.why(listed(entries, most=words.MOST), reason)}", highlight=False)
+        console.print(f"unknown: {words.why(listed(entries, most=words.MOST), reason)}", highlight=False)
     for text in result.notes:
         console.print(f"note: {words.note(text)}", highlight=False)
     console.print(words.verdict(result), highlight=False)

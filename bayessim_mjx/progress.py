@@ -6,15 +6,19 @@ False never; a function `(stage, done, total)` is called instead.
 
 import contextlib
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol, TextIO
+from typing import Any, Protocol, TextIO, runtime_checkable
 
 from bayessim_mjx.quantities import duration
 
 EVERY = 10.0  # s between two lines of one stage
+BEAT = 30.0  # s without a line, such as while a program is compiled, after which one says that the stage still runs
+BESIDE = 52  # columns of a terminal that a bar, its count and its two times take
 
 
+@runtime_checkable
 class Show(Protocol):
     """Where progress goes."""
 
@@ -57,7 +61,7 @@ class Lines:
     def __init__(self, file: TextIO, now: Callable[[], float] = time.monotonic):
         self.file, self.now, self.began = file, now, now()
         self.stage, self.since, self.first, self.reported = "", self.began, 0, 0.0
-        self.done, self.at = 0, self.began  # the last count, and when it was reached
+        self.done, self.at, self.total = 0, self.began, 1  # the last count, and when it was reached
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
         now = self.now()
@@ -66,6 +70,7 @@ class Lines:
             self.done, self.at = done, now
         if done != self.done:
             self.done, self.at = done, now
+        self.total = total
         if now - self.reported >= EVERY:
             self.reported = now
             counted = f": {done} of {total}{self._left(now, done, total)}" if total > 1 else ""
@@ -73,6 +78,14 @@ class Lines:
 
     def line(self, text: str) -> None:
         print(text, file=self.file, flush=True)
+
+    def beat(self) -> None:
+        """Say that the stage still runs, after BEAT s without a line."""
+        now = self.now()
+        if self.stage and now - self.reported >= BEAT:
+            self.reported = now
+            counted = f": {self.done} of {self.total}" if self.total > 1 else ""
+            self.line(f"{now - self.began:6.1f} s  {self.stage}{counted}, {duration(now - self.since)} so far")
 
     def _left(self, now: float, done: int, total: int) -> str:
         """Time to go in this stage at the pace of its last count; nothing where that time is over."""
@@ -92,26 +105,50 @@ class Bars:
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
         if stage not in self.stages:
-            for other in self.stages.values():
-                self.bars.update(other, completed=self.bars.tasks[other].total)
-            self.stages[stage] = self.bars.add_task(stage, total=max(total, 1))
-        shown = f"{stage}, {note}" if note else stage
-        self.bars.update(self.stages[stage], description=shown, completed=done, total=max(total, 1))
+            for other in (k for k in self.stages.values() if not self.bars.tasks[k].finished):
+                known = self.bars.tasks[other].total
+                whole = {"count": f"{known:.0f}/{known:.0f}"} if known else {}
+                self.bars.update(other, completed=known or 1, total=known or 1, **whole)
+            self.stages[stage] = self.bars.add_task(stage, total=None, count="")
+        shown, room = f"{stage}, {note}" if note else stage, max(self.bars.console.width - BESIDE, 20)
+        shown = shown if len(shown) <= room else f"{shown[: room - 1]}…"
+        many = total > 1  # a stage of one part has no share that is done: its bar moves from side to side
+        count = dict(completed=done, total=total, count=f"{done}/{total}") if many else dict(total=None, count="")
+        self.bars.update(self.stages[stage], description=shown, **count)
 
     def line(self, text: str) -> None:
         self.bars.console.print(text, highlight=False, markup=False)
 
 
 @contextlib.contextmanager
+def beating(beat: Callable[[], None]) -> Iterator[None]:
+    """Call a function every second, on a thread of its own, while the block lasts."""
+    over = threading.Event()
+
+    def run() -> None:
+        while not over.wait(1.0):
+            beat()
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@contextlib.contextmanager
 def stages(headless: bool) -> Iterator[Show]:
     """Progress on stderr: bars on a terminal unless `headless`, else lines."""
     if headless or not sys.stderr.isatty():
-        yield Lines(sys.stderr)
+        lines = Lines(sys.stderr)
+        with beating(lines.beat):
+            yield lines
         return
     from rich.console import Console
     from rich.progress import (
         BarColumn,
-        MofNCompleteColumn,
         Progress,
         SpinnerColumn,
         TextColumn,
@@ -119,8 +156,8 @@ def stages(headless: bool) -> Iterator[Show]:
         TimeRemainingColumn,
     )
 
-    text, bar = TextColumn("{task.description}", markup=False), BarColumn()
-    columns = (SpinnerColumn(), text, bar, MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    words, count = (TextColumn(field, markup=False) for field in ("{task.description}", "{task.fields[count]}"))
+    columns = (SpinnerColumn(), words, BarColumn(20), count, TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, transient=True, console=Console(stderr=True)) as bars:
         yield Bars(bars)
 

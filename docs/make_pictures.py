@@ -2,8 +2,9 @@
 
     python docs/make_pictures.py [--work DIR] [--only loop diagnosis]
 
-Runs `main --task Pendulum` with three rounds and `diagnose` on the logs of examples/diagnose_pendulum.py, each in a
-pseudo-terminal (Linux, macOS), about five minutes together on two cores. What is already in --work is not run again.
+Runs `main --task Pendulum`, the first command of README, and `diagnose` on the logs of examples/diagnose_pendulum.py,
+each in a pseudo-terminal (Linux, macOS), about ten minutes together on two cores. What is already in --work is not run
+again.
 
 - loop.svg, diagnosis.svg: the terminal, by rich's export
 - posterior.png: the corner plot of the last round
@@ -40,8 +41,8 @@ LARGEST = {".svg": 200_000, ".png": 200_000, ".gif": 1_000_000, ".html": 300_000
 PLOTLY = re.compile(r"<script>/\*\*\s*\* plotly\.js.*?</script>", re.DOTALL)
 GIF = "fps=15,scale=240:-1:flags=lanczos,split[a][b];[a]palettegen=max_colors=64[p];[b][p]paletteuse=dither=none"
 PLAY = "play --task Pendulum --checkpoint best --video"
-LOOP = "main --task Pendulum bayessim.realIters=3"
-DIAGNOSIS = "diagnose --task Pendulum --data motion --out found"
+LOOP = "main --task Pendulum"
+DIAGNOSIS = "diagnose --task Pendulum --data motion --accuracy 5% --out found"
 EFFECTS = "coulomb_friction,viscous_friction,actuator_gain,actuator_delay,joint_offset"
 DARK = [(40, 42, 46), (179, 38, 30), (46, 125, 50), (160, 106, 0), (21, 101, 192), (123, 31, 162), (0, 121, 107)]
 THEME = TerminalTheme((250, 250, 248), (40, 42, 46), [*DARK, (110, 110, 110)], [(110, 110, 110), *DARK[1:], DARK[0]])
@@ -195,7 +196,9 @@ def diagnosis_pictures(work: Path, out: Path) -> None:
     subprocess.run(command, check=True, capture_output=True)
     from PIL import Image
 
-    Image.open(picture).convert("RGB").quantize(128).save(picture, optimize=True)  # text and bars: few colours
+    # text and bars have few colours; a median cut loses those of small squares
+    few = Image.open(picture).convert("RGB").quantize(128, method=Image.Quantize.MAXCOVERAGE)
+    few.save(picture, optimize=True)
 
 
 PICTURES = {"loop": loop_pictures, "diagnosis": diagnosis_pictures}

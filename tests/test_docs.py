@@ -100,6 +100,15 @@ def broken(page: Path) -> list[str]:
     return found
 
 
+WORDS = {"README.md": 700, "CHANGELOG.md": 400, "docs/**/*.md": 18_000}  # marks of tables count as words
+
+
+@pytest.mark.parametrize("pages", WORDS)
+def test_pages_keep_to_their_words(pages):
+    files = sorted(ROOT.glob(pages))
+    assert files and sum(len(f.read_text(encoding="utf-8").split()) for f in files) <= WORDS[pages]
+
+
 def by_name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 

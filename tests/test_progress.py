@@ -2,12 +2,14 @@
 
 import io
 import sys
+import threading
+import time
 import types
 
 import pytest
 
 from bayessim_mjx import progress
-from bayessim_mjx.progress import EVERY, Lines
+from bayessim_mjx.progress import BEAT, EVERY, Bars, Lines
 
 
 class Terminal(io.StringIO):
@@ -90,3 +92,52 @@ def test_the_time_to_go_runs_down_while_a_part_lasts_and_is_not_made_up_where_it
     for done in (0, 1, 1):
         say("polishing", done, 2)
     assert file.getvalue().splitlines()[-1].endswith("polishing: 1 of 2")
+
+
+def test_a_stage_without_counts_says_that_it_still_runs():
+    """As compilation does, for minutes."""
+    clock, file = iter([0.0, 1.0, 2.0, 1.0 + BEAT, 2.0 + BEAT, 1.0 + 2 * BEAT]), io.StringIO()
+    say = Lines(file, lambda: next(clock))
+    say("compiling the simulator", 0, 1)
+    for _ in range(4):
+        say.beat()
+    assert file.getvalue().splitlines() == [
+        "   1.0 s  compiling the simulator",
+        "  31.0 s  compiling the simulator, 30 s so far",
+        "  61.0 s  compiling the simulator, 1 min 00 s so far",
+    ]
+
+
+def test_the_beat_ends_with_its_block():
+    calls = []
+    with progress.beating(lambda: calls.append(threading.active_count())):
+        time.sleep(1.3)
+    assert len(calls) == 1 and calls[0] == threading.active_count() + 1
+
+
+@pytest.mark.parametrize("width", [60, 80, 110])
+def test_a_long_stage_leaves_room_for_its_bar(width, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setenv("TERM", "xterm")
+    with progress.stages(headless=False) as show:
+        assert isinstance(show, Bars)
+        show("a stage of many words " * 6, 1, 2)
+        show.bars.refresh()
+    text = sys.stderr.getvalue()
+    assert "…" in text and "1/2" in text and "0:00:00" in text
+
+
+def test_a_stage_that_has_ended_is_whole(monkeypatch):
+    """Its last count was `64/67`, as counts come after batches."""
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("TERM", "xterm")
+    with progress.stages(headless=False) as show:
+        show("compiling", 0, 1)
+        show("screening", 64, 67)
+        show("single effects", 0, 3)
+        show("screening again", 0, 3)
+        counts = {task.description: task.fields["count"] for task in show.bars.tasks}
+        whole = [task.finished for task in show.bars.tasks]
+    assert counts == {"compiling": "", "screening": "67/67", "single effects": "3/3", "screening again": "0/3"}
+    assert whole == [True, True, True, False]

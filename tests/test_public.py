@@ -68,3 +68,8 @@ def _asked(text, extra=""):
     """(name, extras, limits, extra of ours) of a requirement; limits as uv writes them, the lower one first."""
     name, extras, limits = re.match(r"([\w.-]+)(?:\[(.*)\])?(.*)", text).groups()
     return name.lower().replace("_", "-"), extras or "", limits, extra
+
+
+def test_completion_offers_the_public_names():
+    """They are imported when first used; without this `bayessim_mjx.<TAB>` offers what happens to be imported."""
+    assert {*bayessim_mjx.__all__} == {*dir(bayessim_mjx)} and "diagnose" in dir(bayessim_mjx)

@@ -51,7 +51,7 @@ def run(check: Check, limits: Limits, say: Say, between: Between = lambda outcom
         UserError: what is wrong with model, logs or effects; a seal that is broken.
     """
     check.begin()
-    say("measuring what the robot does", 0, 1)
+    say("measuring the robot's motion", 0, 1)
     own = bench(check)
     groups, unknown = own.groups(check.effects), own.unknown()
     done = {i for i in range(limits.cases) if (check.answer(i) / EXIT).exists()}

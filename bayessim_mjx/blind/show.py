@@ -18,7 +18,7 @@ Found = Mapping[str, Any]
 TEMPLATE = "page.html.j2"
 RATES = (
     ("found", "hidden effects named at their place"),
-    ("in_the_set", "named, or among the rivals of what is named"),
+    ("in_the_set", "named, or among the rivals of the named effect"),
     ("false_alarms", "false alarms where nothing is hidden"),
     ("unknown_unexplained", "unknown causes called unexplained"),
     ("coverage", "90 % intervals that hold the truth"),
@@ -73,7 +73,7 @@ def console(found: Found, folder: Path, out: Any) -> None:
     out.grid(header, rows)
     header, rows = lookalikes(found)
     if rows:
-        out.grid(header, rows, "look-alikes that these experiments do not separate", left=(0, 1, 3))
+        out.grid(header, rows, "similar effects that these experiments do not separate", left=(0, 1, 3))
     out.say(str(folder / PAGE))
 
 
@@ -94,7 +94,7 @@ def lookalikes(found: Found) -> tuple[list[str], list[list[str]]]:
         best = f"{p['excitation']} ({p['by']:.1f} noises)" if p["excitation"] else "none of the menu"
         pair = [title(p["hidden"], p["where"]), title(p["rival"], p["rival_where"])]
         rows.append([*pair, f"{p['left']:.2f}", best])
-    return ["hidden", "explained as well by", "noises between them", "told apart by"], rows
+    return ["hidden", "explained as well by", "noises between them", "separated by"], rows
 
 
 def untried(found: Found) -> list[str]:

@@ -35,7 +35,11 @@ FLAGS: dict[str, tuple[str, Any, str]] = {
     "--name": ("name", str, "word added to the name of the run folder"),
     "--device": ("device", str, "auto, cpu, gpu, gpu:1 or cuda:0"),
     "--devices": ("devices", str, "number of devices that share the worlds, or all"),
-    "--cache_dir": ("cache_dir", str, "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE)"),
+    "--cache_dir": (
+        "cache_dir",
+        str,
+        "folder of compiled programs, or off (default: $BAYESSIM_MJX_CACHE, else ~/.cache/bayessim_mjx)",
+    ),
 }
 TASK, TRAINING, OUTPUT, COMPUTING = "task and settings", "training", "output", "computing"
 PLAYED = "policy"  # heading of the checkpoint in `play`

@@ -158,7 +158,7 @@ def warm_start(train: Any, config: Config, env: Any, say: Callable[[str], None] 
                 f"but here the ranges are {_ranges(env.space)}; give those of its run (params/env.yaml by --cfg_env)"
             )
     say(
-        f"from {path}: the policy and the statistics of what it observes; critic, state of Adam and learning rate "
+        f"from {path}: the policy and the statistics of its observations; critic, state of Adam and learning rate "
         f"({float(train.learning_rate):g}) are new"
     )
     normalizer = {**train.normalizer, "policy": policy.normalizer}

@@ -67,7 +67,7 @@ def _interval(r: Mapping[str, Any]) -> str:
     if r["corrected"]["ci"]:
         return "90 % interval {} to {}".format(*map(percent, r["corrected"]["ci"]))
     if r["seeds"] >= FEWEST:
-        return "no interval: what was lost is not known well enough"
+        return "no interval: the loss is not known well enough"
     return f"{count(r['seeds'], 'seed')}: no interval; trainings differ, --seeds {FEWEST} gives one"
 
 

@@ -335,7 +335,7 @@ class BayesSimConfig(Section):
         choices=("report", "move"),
     )
     distrust: float = setting(
-        0.5, "most of the prior mixed into the randomisation where the real trajectories look unlike simulated ones",
+        0.5, "most of the prior mixed into the randomisation where the real trajectories are unlike simulated ones",
         low=0, high=1,
     )  # fmt: skip
     realEvals: int = setting(100, "surrogate-real episodes that score the policy each round", low=1, high=COUNT)
@@ -464,7 +464,9 @@ class PPOConfig(Section):
     )  # fmt: skip
     init_std: float = setting(1.0, "initial standard deviation of actions", above=0)
     std_type: str = setting(
-        "log", "what is learnt: the logarithm of the standard deviation or itself", choices=("log", "scalar")
+        "log",
+        "learnt number: the logarithm of the standard deviation, or itself",
+        choices=("log", "scalar"),
     )
     std_range: tuple[float, ...] = setting((), "least and greatest standard deviation; none: no limits", above=0)
     distribution: str = setting(
@@ -482,7 +484,7 @@ class PPOConfig(Section):
         (), "observation groups that the actor sees, one after the other; none: policy (train, play)"
     )
     critic_groups: tuple[str, ...] = setting(
-        (), "observation groups that the critic sees; none: critic where there is one, else what the actor sees"
+        (), "observation groups that the critic sees; none: critic where there is one, else the actor's groups"
     )
     memory_cell: str = setting("gru", "kind of the recurrent layer: gru or lstm", choices=tuple(MEMORIES))
     critic_theta: bool = setting(False, "the critic also sees the physics, theta (not the actor)")
@@ -491,7 +493,7 @@ class PPOConfig(Section):
     distil_loss: str = setting("mse", "error of the imitated actions", choices=("mse", "huber"))
     action_clip: float = setting(1.0, "actions are kept within +- this before the environment", above=0)
     action_bound: str = setting("clip", "how: clipped, or squashed by action_clip * tanh", choices=("clip", "tanh"))
-    rnd: RNDConfig | None = setting(None, "random network distillation: rewards for what is new; null: none")
+    rnd: RNDConfig | None = setting(None, "random network distillation: rewards for novel states; null: none")
     symmetry: SymmetryConfig | None = setting(None, "use of the robot's mirror symmetry; null: none")
     extensions: tuple[typing.Any, ...] = setting(
         (), "extensions of your own: list of {extension: NAME, setting: value, ...}; docs/ppo_extensions.md"

@@ -181,7 +181,7 @@ FRAMES = {
 }  # fmt: skip
 WHOLE = {"golden": "golden pairs", "clock": "rate of control"}
 WHY = {
-    "unknown": "the manifest does not say what it follows from",
+    "unknown": "the manifest does not name its source",
     "no_source": "the log has no channel that it follows from",
     "not_logged": "it is not in the log",
     "still": "the log does not move it",
@@ -190,11 +190,11 @@ WHY = {
 NOTES = {
     "no_actions": "no actions in the log: the policy's answers are not compared",
     "no_observations": "no complete observation in the log: the policy's answers are not compared",
-    "no_commands": "no commands in the log (ctrl:<actuator>): scale, offset and order of commands cannot be told",
+    "no_commands": "no commands in the log (ctrl:<actuator>): scale, offset and order of commands are unknown",
     "rebuilt": "no observations in the log: the actions follow from the logged state as the manifest says",
     "rebuilt_unlike": (
         "no observations in the log, and the actions do not follow from the logged state by any single mistake that "
-        "was tried: noise, several mistakes, or another policy; log what the policy sees (observation:<name>)"
+        "was tried: noise, several mistakes, or another policy; log the policy's observations (observation:<name>)"
     ),
     "not_rebuilt": "no observations in the log, and its state does not give all of them: log observation:<name>",
     "no_scale": "commands are no multiples of the actions: they are not compared",

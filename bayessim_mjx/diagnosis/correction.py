@@ -22,7 +22,7 @@ from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import Physics
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Estimate:
     """One identified number.
 
@@ -38,8 +38,8 @@ class Estimate:
     unit: str = ""
     bound: str = ""
 
-    def __str__(self) -> str:
-        """`0.1191 +- 0.0016 N m`: rounded by the standard deviation."""
+    def __repr__(self) -> str:
+        """`0.1191 +- 0.0016 N m`: rounded by the standard deviation, also inside of `FoundEffect.parameters`."""
         return f"{quantities.estimate(self.mean, self.sd).replace('±', '+-')} {self.unit}".rstrip()
 
 

@@ -20,6 +20,7 @@ from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.numbers import Budget, Progress
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.setup import Setup
+from bayessim_mjx.quantities import listed
 
 T = TypeVar("T")
 
@@ -75,6 +76,9 @@ class Observer:
 
     def progress(self, text: str, done: int, total: int) -> None:
         """Take the name of a part, when it begins and while it goes on, and how much of it is done."""
+
+    def note(self, text: str) -> None:
+        """Take a warning that is known before the search."""
 
     def early(self, lines: Sequence[str]) -> None:
         """Take what the logs show before any simulation, in lines."""
@@ -140,7 +144,7 @@ def carry_out(stages: Sequence[Stage], found: Findings, time_left: Budget, obser
 
 def _together(stages: Sequence[Stage], found: Findings, observer: Observer) -> Findings:
     """Run each stage on a thread: compilation and simulation release Python's lock."""
-    name = ", ".join(s.name for s in stages)
+    name = listed([s.name for s in stages], most=2)
     done: list[Stage] = []
 
     def one(stage: Stage) -> Findings:

@@ -88,12 +88,12 @@ def rivals_without_physics(found: Findings, say: Progress) -> Findings:
 
 
 STAGES = (
-    Stage("how far", how_far),
-    Stage("none of these?", none_of_these),
-    Stage("finer steps", again.at_finer_steps, patient=True, beside=True),
+    Stage("size of the gap", how_far),
+    Stage("missing force", none_of_these),
+    Stage("finer time steps", again.at_finer_steps, patient=True, beside=True),
     Stage("whole logs", again.over_whole_logs, patient=True, beside=True),
-    Stage("where", where_it_lies, optional=True, beside=True),
-    Stage("black boxes", rivals_without_physics, optional=True, beside=True),
+    Stage("place of the gap", where_it_lies, optional=True, beside=True),
+    Stage("network and formula", rivals_without_physics, optional=True, beside=True),
     Stage("next experiment", propose.stage, optional=True, beside=True),
 )
 
@@ -116,12 +116,12 @@ def investigate(
     Raises:
         UserError: nothing usable. TooLittleData: nothing could be held out.
     """
-    observer.progress("looking at the logs", 0, 1)
+    observer.progress("checking the logs", 0, 1)
     time_left = numbers.begun(request.minutes)
     setup = prepare(robot, logs, request, time_left, lambda look: observer.early(notes.first_look(look)))
     setup = remembering(setup, request.remember)
     for text in setup.said:
-        observer.progress(text, 0, 1)
+        observer.note(text)
     observer.known(setup, None)
     given = setup.fitter, setup.candidates, setup.settings
     found = selecting.select(*given, observer.progress, lambda state: observer.known(setup, state))

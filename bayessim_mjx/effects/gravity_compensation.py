@@ -36,7 +36,7 @@ class GravityCompensation(Effect):
     separates: ClassVar[str] = "holding still in several poses, and fast motion about them"
     witness: ClassVar[tuple[str, str] | None] = (
         "effort",
-        "the drives' measured effort (`effort:<actuator>`), which contains what the firmware adds",
+        "the drives' measured effort (`effort:<actuator>`), which contains the firmware's share",
     )
     quantities: ClassVar[tuple[Quantity, ...]] = (Quantity("share", 0.0, -0.5, 1.5, grid=(0.05, 0.2, 0.5)),)
 

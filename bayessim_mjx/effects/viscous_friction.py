@@ -34,7 +34,7 @@ class ViscousFriction(Effect):
     kind: ClassVar[str] = "joint"
     effort: ClassVar[str] = "speed"
     noun: ClassVar[str] = "viscous friction"
-    separates: ClassVar[str] = "a staircase of constant speeds; swings with the drive off tell it from back-EMF"
+    separates: ClassVar[str] = "a staircase of constant speeds; swings with the drive off separate it from back-EMF"
     witness: ClassVar[tuple[str, str] | None] = (
         "temperature",
         "temperature of motor or gearbox (`temperature`): grease thins as it warms",

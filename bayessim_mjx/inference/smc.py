@@ -90,7 +90,7 @@ class ParticleState:
         if self.power != to:
             return f"the likelihood can be followed to its power {self.power:.2g} only"
         if not self.ess >= enough:
-            return f"the draws are worth {self.ess:.0f} independent ones, {enough:.0f} are needed"
+            return f"the draws have an effective sample size of {self.ess:.0f}, {enough:.0f} is needed"
         if self.memory > KEPT:
             return f"draws still depend on where they began, correlation {self.memory:.2f}"
         return "the draws' likelihood still changes" if abs(self.trend) > STILL else None

@@ -29,7 +29,7 @@ from bayessim_mjx.logs.table import Table
 from bayessim_mjx.logs.transport import described
 from bayessim_mjx.logs.vendors import hinges
 
-HEAD = """# Proposed from the names of the columns; look through it, and edit it (docs/logs.md).
+HEAD = """# Proposed from the names of the columns; read it, and edit it (docs/logs.md).
 # A channel is `name: column`, or `name: {column: ..., unit: deg, sign: -1, offset: 0.1}`.
 """
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc")

@@ -232,7 +232,7 @@ def filled(
     blank = {name: np.full(rows, home.get(name, 0.0)) for name in absent}
     positions = [name for name in absent if name.startswith("qpos:")]
     if positions:
-        text = f"{table.path}: no column {', '.join(positions)}: this motion is estimated from what was measured"
+        text = f"{table.path}: no column {', '.join(positions)}: this motion is estimated from the measurements"
         warnings.warn(text, stacklevel=4)
     return {**columns, **blank}, tuple(absent)
 

@@ -106,7 +106,7 @@ BOTH = (
     "(docs/logs.md)"
 )
 MIXED = (
-    'stands beside numbers with decimal points or commas, so neither mark is sure; state `decimal: "."` or '
+    'appears beside numbers with decimal points or commas, so neither mark is sure; state `decimal: "."` or '
     '`decimal: ","`, and `thousands` for the other mark, in a map (docs/logs.md)'
 )
 

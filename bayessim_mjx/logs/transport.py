@@ -86,7 +86,7 @@ def described(table: Table, sources: Mapping[str, Source]) -> list[str]:
         have = [end for end in ends if end in sources]
         if len(have) == 1:
             lost = next(end for end in ends if end not in sources)
-            said.append(f"{table.path.name}: {have[0]} tells no delay without {lost}")
+            said.append(f"{table.path.name}: {have[0]} gives no delay without {lost}")
         if len(have) < 2:
             continue
         try:

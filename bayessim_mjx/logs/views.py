@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.channel_units import units_of
 from bayessim_mjx.logs.files import map_of_folder
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.mapping import LogMap
@@ -53,13 +54,14 @@ class View:
 
     Attributes:
         overview: tables and notes of `logs check`. sheets: the logs. limits: {joint: (low, high)} of the model.
-        pairs: {joint: actuators that drive it by the model}.
+        pairs: {joint: actuators that drive it by the model}. units: {channel: unit}, of a model.
     """
 
     overview: Overview
     sheets: list[Sheet] = field(default_factory=list)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     pairs: dict[str, list[str]] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
 
 
 def view(path: Path, model: mujoco.MjModel | None, map_file: str | None = None) -> View:
@@ -78,6 +80,7 @@ def view(path: Path, model: mujoco.MjModel | None, map_file: str | None = None) 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the overview has them as notes
             out.sheets = [_sheet(log) for log in read_logs(files_of(path, log_map), model, log_map, partial=True)]
+        out.units = units_of(model)
     else:
         out.sheets = _as_written(path, log_map)
     if model is not None:

@@ -126,7 +126,7 @@ class Refinement:
         """One line: what was done, or why it was not."""
         if not self.used:
             return f"the network's posterior is kept: {self.refined.reason}"
-        text = f"refined by {self.refined.simulations} replays, worth {self.refined.effective:.0f} independent draws"
+        text = f"refined by {self.refined.simulations} replays, effective sample size {self.refined.effective:.0f}"
         return text + (f", {self.widening:.2g} times wider as trajectories disagree" if self.widening > 1 else "")
 
     def to_dict(self) -> dict[str, Any]:

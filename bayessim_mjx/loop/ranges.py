@@ -107,7 +107,7 @@ def move(loop: Loop, state: LoopState, posterior: Distribution) -> tuple[Distrib
     moving = state.moving.replace(space=space, covered=before, rows=rows, next=rows)  # type: ignore[attr-defined]
     kept, warnings = {"moving": moving}, []
     if loop.source.policy_dependent:  # type: ignore[union-attr]
-        warnings.append("ranges have moved: what earlier real trajectories tell is known within the old ones only")
+        warnings.append("ranges have moved: earlier real trajectories count within the old ranges only")
         kept["real_posteriors"] = _forgotten(state.real_posteriors, space)
     return posterior.over(space), moves, Evidence({"moves": moves}, warnings=warnings, kept=kept)
 

@@ -172,7 +172,7 @@ def recorded(config: Config, env: Any, summarizer: Summarizer) -> Recorded:
     if len(order) < needed:
         raise UserError(
             f"real.logs: the logs hold {len(order)} segments of {length} steps ({length * env.dt:.3g} s) that share no "
-            f"time, bayessim.realTrajs={needed} are asked for; shorten bayessim.trainTrajLen or record more"
+            f"time, bayessim.realTrajs={needed} are needed; shorten bayessim.trainTrajLen or record more"
         )
     if len(order) < len(pool):
         notes.append(

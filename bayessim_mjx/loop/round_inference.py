@@ -202,7 +202,7 @@ def complaints(
         texts.append(f"{int(fit['n_invalid'])} simulated trajectories left out: their summaries are not finite")
     if fresh and fit["best"] < 0:
         n = f"{int(fit['steps'])} steps on {int(fit['n_train'])} trajectories"
-        other = "another summary (bayessim.summarizerFxn) or longer trajectories (bayessim.trainTrajLen) may tell more"
+        other = "another summary (bayessim.summarizerFxn) or longer trajectories (bayessim.trainTrajLen) may help"
         hint = "" if np.any(fit["identified"]) else f"; {other}"
         texts.append(f"the network is the linear posterior that training begins at: {n} found none better{hint}")
     if fit["skipped"] > 0:

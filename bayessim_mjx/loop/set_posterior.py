@@ -134,7 +134,7 @@ def _usable(loop: Loop, state: LoopState, product: Distribution) -> Array:
             "earlier trajectories were made by other policies, which sets cannot be simulated with any more"
         )
     if float(product.prior_weight) >= REGION:
-        raise UserError("they have told nothing yet")
+        raise UserError("they have no result yet")
     real = state.real_features[: (round_ + 1) * b.realTrajs]
     real = real[np.isfinite(np.asarray(real)).all(axis=1)]
     if not len(real):

@@ -32,6 +32,7 @@ __all__ = ["corner", "pair", "predictive"]
 FULL_CORNER = 12  # up to so many parameters every pair is drawn
 MOST = 8  # parameters by name, those whose ranks are least uniform
 BAND = 1.36  # of sqrt(n) sup |F_n - F|: 95 % (Kolmogorov)
+STAYS = "95 % of calibrated posteriors stay inside"
 
 
 def corner(
@@ -191,13 +192,15 @@ def _ecdf(values: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 def _coverage(axes: Any, report: Any) -> None:
     at = np.linspace(0, 1, 101)
-    band = 2 * np.sqrt(at * (1 - at) / report.pairs)
-    axes.fill_between(at, at - band, at + band, color=GREY, alpha=0.2, lw=0, label="calibrated, ± 2 standard errors")
+    half = BAND / np.sqrt(report.pairs)
+    low, high = np.maximum(at - half, 0), np.minimum(at + half, 1)
+    axes.fill_between(at, low, high, color=GREY, alpha=0.2, lw=0, label=STAYS)
     axes.plot(at, _ecdf(report.ranks.level, at), color=BLUE, lw=2, label="densest regions (HPD)")
     axes.plot(at, _ecdf(report.ranks.tarp, at), color=GREEN, lw=1.5, ls="--", label="regions around a point (TARP)")
     for level, (share, error) in report.coverage.items():
         reach = [[min(2 * error, share)], [min(2 * error, 1 - share)]]
-        axes.errorbar([level], [share], yerr=reach, color="black", marker="o", ms=4, capsize=3, clip_on=False)
+        bar = axes.errorbar([level], [share], yerr=reach, color="black", marker="o", ms=4, capsize=3, clip_on=False)
+    bar.set_label("observed coverage, ± 2 standard errors")
     axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="probability of the region", ylabel="share of true parameters inside")
     axes.set_title("coverage: below the band the posterior is too narrow, above too wide", fontsize=9, loc="left")
     axes.legend(loc="upper left", frameon=False, fontsize=8)
@@ -228,8 +231,8 @@ def _sets(axes: Any, sets: Any) -> None:
 
 def _ranks(axes: Any, report: Any) -> None:
     at, n = np.linspace(0, 1, 201), report.pairs
-    half, stays = BAND / np.sqrt(n), "95 % of calibrated posteriors stay inside"
-    axes.axhspan(-half, half, color=GREY, alpha=0.2, lw=0, label=stays)
+    half = BAND / np.sqrt(n)
+    axes.axhspan(-half, half, color=GREY, alpha=0.2, lw=0, label=STAYS)
     worst = np.argsort([report.p[name] for name in report.names])
     from matplotlib import colormaps
 

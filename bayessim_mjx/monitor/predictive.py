@@ -32,7 +32,7 @@ def predictive(
         time: [T] seconds. real: {channel: [T] or [m, T]}. simulated: {channel: [n, T]}; NaN where an episode was over.
         units: {channel: unit}; a channel `qpos:elbow` or `qvel:elbow` is called by its quantity and joint.
         before: {channel: [n, T]} the same under the prior, drawn as a pale band.
-        most: at most so many channels; those that simulation explains worst come first. lines: single simulations.
+        most: at most so many channels; of more, the worst explained ones, worst first. lines: single simulations.
     Raises:
         ValueError: no channel in common, or a length that is not T.
     """
@@ -41,7 +41,7 @@ def predictive(
     if not data:
         raise ValueError(f"no channel in common: real has {sorted(real)}, simulated has {sorted(simulated)}")
     ranked = sorted(data, key=lambda k: -_mismatch(*data[k]))
-    shown = ranked[:most]
+    shown = ranked[:most] if len(ranked) > most else list(data)  # the same places in every round
     columns = 1 if len(shown) <= 3 else 2
     rows = -(-len(shown) // columns)
     figure = new_figure(9.0 if columns == 1 else 12.0, 1.1 + 2.0 * rows, layout="constrained")

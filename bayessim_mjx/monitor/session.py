@@ -198,7 +198,7 @@ class Session:
     def _note(self, info: RoundInfo) -> None:
         """rounds.jsonl: the numbers of every round, for scripts."""
         row = {
-            "round": info.round,
+            "round": info.round + 1,  # as the console counts
             "returns": {"mean": float(info.returns.mean()), "sd": float(info.returns.std()), "n": len(info.returns)},
             "scores": info.scores,
             "seconds": {name: float(value) for name, value in info.seconds.items()},
@@ -219,10 +219,10 @@ class Session:
             file.write(json.dumps(row) + "\n")
 
     def _drop_rounds(self, first: int) -> None:
-        """On resume: rounds from `first` on will be written again."""
+        """On resume: rounds after the first `first` will be written again."""
         file = self.path / ROUNDS
         if file.exists():
-            rows = [line for line in file.read_text(encoding="utf-8").splitlines() if _round_of(line) < first]
+            rows = [line for line in file.read_text(encoding="utf-8").splitlines() if _round_of(line) <= first]
             atomic.write_text(file, "".join(row + "\n" for row in rows))
 
     def flush(self) -> None:

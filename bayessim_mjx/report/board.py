@@ -68,7 +68,7 @@ def waterfall(level: Mapping[str, float], stages: Mapping[str, Any]) -> Any:
     """Draw the squared gap from the delivered simulator down to the noise; roots over the stages."""
     figure = new_figure(8.0, 3.6, layout="constrained")
     axes = figure.subplots()
-    bars = [("as delivered", 0.0, level["nominal"], "nominal", number(stages["nominal"]))]
+    bars = [("as delivered", 0.0, level["nominal"], "nominal", f"{number(stages['nominal'])} noise sd")]
     before, last = level["nominal"], "with_effects" if "with_effects" in level else "calibrated"
     for stage in falls(level):
         change = level[stage] - before
@@ -77,13 +77,13 @@ def waterfall(level: Mapping[str, float], stages: Mapping[str, Any]) -> Any:
             (part_words(stage, level, stages.get("floor", "")), low, abs(change), stage, percent(change, sign=True))
         )
         if stage == last:
-            bars.append((STAGES[stage], 0.0, level[stage], stage, number(stages[stage])))
+            bars.append((STAGES[stage], 0.0, level[stage], stage, f"{number(stages[stage])} noise sd"))
         before = level[stage]
     for k, (_, base, height, stage, words) in enumerate(bars):
         axes.bar(k, height, 0.62, base, color=STAGE[stage], edgecolor="black", linewidth=0.5)
         axes.text(k, base + height + 0.02, words, ha="center", va="bottom", fontsize=9)
     axes.set_xticks(range(len(bars)), [b[0].replace(" ", "\n", 1) for b in bars], fontsize=9)
-    axes.set(ylabel="squared gap / largest", ylim=(0, 1.14))
+    axes.set(ylabel="squared gap, share of the largest", ylim=(0, 1.14))
     return _plain(figure, axes)
 
 

@@ -44,7 +44,7 @@ def _worst(row: Mapping[str, Any]) -> float:
 
 def parameters(d: Diagnosis) -> dict[str, Any]:
     """Recalibrated parameters in their ranges, and their estimates per operating condition."""
-    rows = []
+    rows, known = [], next((c for c in d.candidates if not c.get("effects")), {}) if d.effects else {}
     for name, p in d.parameters.items():
         mean, sd = p.get("mean"), p.get("sd")
         ranged = known_span((p.get("low"), p.get("high")))
@@ -56,6 +56,7 @@ def parameters(d: Diagnosis) -> dict[str, Any]:
                 "name": name,
                 "nominal": number(p.get("nominal")),
                 "value": estimate(mean, sd),
+                "alone": number((known.get("parameters") or {}).get(name)) if known else "",
                 "unit": unit(p.get("unit") or ""),
                 "structural": p.get("structural") or "",
                 "data_sheet": p.get("data_sheet") or "",
@@ -71,7 +72,14 @@ def parameters(d: Diagnosis) -> dict[str, Any]:
     names = found.get("names") or []
     numbered = [] if rival_figures.fits(names) else names
     left = max(len(moves) - 12, 0)
-    return {"rows": rows, "accuracy": accuracy(d), "groups": figure, "numbered": numbered, "left": left}
+    return {
+        "rows": rows,
+        "alone": bool(known),
+        "accuracy": accuracy(d),
+        "groups": figure,
+        "numbered": numbered,
+        "left": left,
+    }
 
 
 def isolability(d: Diagnosis) -> dict[str, Any]:

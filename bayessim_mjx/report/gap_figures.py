@@ -1,5 +1,6 @@
-"""How far: the waterfall of the squared gap, and its parts over the horizons."""
+"""How far: the waterfall of the squared gap."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ from bayessim_mjx.report.look import (
     FAINT,
     HATCH,
     INK,
+    NARROW,
     OVER,
     STAGE,
     WIDTH,
@@ -21,13 +23,13 @@ from bayessim_mjx.report.words import STAGES, known_span, number, percent, wide
 
 # what takes the squared gap down to each stage
 PARTS = {
-    "calibrated": "recalibrated parameters",
+    "calibrated": "recalibration alone",
     "with_effects": "named effects",
     "reducible_floor": "not explained",
     "noise_floor": "not explained",
 }
 FLOORS = {"repeats": "differs between repeats", "start": "uncertain start"}  # what lies between floor and noise
-TICKS = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
+TICKS = [0.0, 0.5, 1.0]  # few enough for a phone
 HIGHEST = 1.6  # of the largest squared gap: where the picture ends, intervals with it
 STEPS = ("nominal", "calibrated", "with_effects")
 
@@ -66,7 +68,7 @@ def part_words(stage: str, level: Mapping[str, float], floor: str = "") -> str:
 def waterfall(
     stages: Mapping[str, Any], shares: Sequence[Mapping[str, Any]], effects: bool = True
 ) -> dict[str, Any] | None:
-    """Bars from the delivered simulator's squared gap down to the noise; `shares` (Shapley) split the effects' part.
+    """Rows from the delivered simulator's squared gap down to the noise; `shares` (Shapley) split the effects' part.
 
     Args:
         stages: one horizon; effects: whether there are any.
@@ -78,54 +80,57 @@ def waterfall(
     if not level:
         return None
     last, words = ("with_effects", "with the effects") if effects else ("calibrated", "recalibrated")
-    columns = [_total("as delivered", "nominal", stages, level, ci), _drop("calibrated", level)]
-    columns += _effects(shares, level) if effects else []
-    columns += [_total(words, last, stages, level, ci)]
-    columns += [_drop(s, level, stages.get("floor", "")) for s in falls(level)[falls(level).index(last) + 1 :]]
-    columns += [_total("measurement noise", "noise_floor", stages, level, ci)] if "noise_floor" in level else []
-    xs = list(range(len(columns)))
-    tops = [min(c["base"] + c["height"] + c["error"][1], HIGHEST) for c in columns]
+    rows = [_total("as delivered", "nominal", stages, level, ci), _drop("calibrated", level)]
+    rows += _effects(shares, level) if effects else []
+    rows += [_total(words, last, stages, level, ci)]
+    rows += [_drop(s, level, stages.get("floor", "")) for s in falls(level)[falls(level).index(last) + 1 :]]
+    rows += [_total("measurement noise", "noise_floor", stages, level, ci)] if "noise_floor" in level else []
+    ends = [min(c["base"] + c["height"] + c["error"][1], HIGHEST) for c in rows]
     marks = [
-        note(c["label"], k, t, xref="x", yref="y", yanchor="bottom", yshift=3, font={"size": 13 if c["total"] else 12})
-        for k, (c, t) in enumerate(zip(columns, tops, strict=True))
+        note(c["label"], end, k, xref="x", yref="y", xanchor="left", xshift=4, align="left", font={"size": 12.5})
+        for k, (c, end) in enumerate(zip(rows, ends, strict=True))
     ]
+    longest = max(len(line) for c in rows for line in re.sub("</?b>", "", c["label"]).split("<br>"))
     return figure(
-        [_bars(columns), _spans(columns)],
+        [_bars(rows), _spans(rows)],
         WIDTH,
-        350,
-        least=100 * len(columns) + 80,
-        shapes=_links(columns),
+        60 + 36 * len(rows),
+        least=NARROW,
+        shapes=_links(rows),
         annotations=marks,
         xaxis=axis(
-            tickvals=xs,
-            ticktext=[c["x"] for c in columns],
-            showgrid=False,
-            ticks="",
+            "squared gap, share of the largest",
+            tickvals=TICKS,
+            tickformat=".0%",
             tickangle=0,
-            range=[-0.5, len(xs) - 0.5],
+            range=[0, max(1.0, *ends) * (1 + 0.035 * longest)],
         ),
         yaxis=axis(
-            "squared gap, share of the largest", tickvals=TICKS, tickformat=".0%", range=[0, max(1.12, 1.1 * max(tops))]
+            tickvals=list(range(len(rows))),
+            ticktext=[c["name"] for c in rows],
+            showgrid=False,
+            ticks="",
+            range=[len(rows) - 0.5, -0.5],
         ),
-        margin={"l": 70, "r": 10, "t": 12, "b": 64},
+        margin={"l": 132, "r": 8, "t": 4, "b": 46},
     )
 
 
-def _spans(columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _spans(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Intervals of the bars that have one."""
-    sure = [k for k, c in enumerate(columns) if any(c["error"])]
+    sure = [k for k, c in enumerate(rows) if any(c["error"])]
     return {
         "type": "scatter",
         "mode": "markers",
-        "x": sure,
-        "y": [columns[k]["end"] for k in sure],
+        "x": [rows[k]["end"] for k in sure],
+        "y": sure,
         "hoverinfo": "skip",
         "marker": {"size": 0.1, "color": INK},
-        "error_y": {
+        "error_x": {
             "type": "data",
             "symmetric": False,
-            "arrayminus": [columns[k]["error"][0] for k in sure],
-            "array": [columns[k]["error"][1] for k in sure],
+            "arrayminus": [rows[k]["error"][0] for k in sure],
+            "array": [rows[k]["error"][1] for k in sure],
             "color": INK,
             "thickness": 1.2,
             "width": 4,
@@ -133,33 +138,34 @@ def _spans(columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _bars(columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _bars(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {
         "type": "bar",
-        "x": list(range(len(columns))),
-        "y": [c["height"] for c in columns],
-        "base": [c["base"] for c in columns],
+        "orientation": "h",
+        "x": [c["height"] for c in rows],
+        "y": list(range(len(rows))),
+        "base": [c["base"] for c in rows],
         "width": 0.62,
         "marker": {
-            "color": [c["colour"] for c in columns],
+            "color": [c["colour"] for c in rows],
             "line": {"color": INK, "width": 0.6},
-            "pattern": {"shape": [c["hatch"] for c in columns], **OVER},
+            "pattern": {"shape": [c["hatch"] for c in rows], **OVER},
         },
-        "hovertext": [c["hover"] for c in columns],
+        "hovertext": [c["hover"] for c in rows],
         "hoverinfo": "text",
     }
 
 
-def _links(columns: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _links(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Dotted lines from the end of each bar to the next."""
-    ends = [c["end"] for c in columns]
+    ends = [c["end"] for c in rows]
     return [
         {
             "type": "line",
-            "x0": k + 0.31,
-            "x1": k + 0.69,
-            "y0": e,
-            "y1": e,
+            "x0": e,
+            "x1": e,
+            "y0": k + 0.31,
+            "y1": k + 0.69,
             "line": {"color": FAINT, "width": 1, "dash": "dot"},
         }
         for k, e in enumerate(ends[:-1])
@@ -169,42 +175,40 @@ def _links(columns: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def _total(words: str, stage: str, stages: Mapping[str, Any], level: Mapping[str, float], ci: Any) -> dict[str, Any]:
     span = known_span((ci or {}).get(stage))
     if span is not None and wide(span):
-        span, between = None, " (wide interval)"
+        span, between = None, "<br>(wide interval)"
     else:
-        between = f" ({number(span[0])} to {number(span[1])})" if span else ""
+        between = f"<br>({number(span[0])} to {number(span[1])})" if span else ""
     ends = [(s / _largest(stages)) ** 2 for s in span] if span else [level[stage]] * 2
     return {
-        "x": _wrap(words, 13),
+        "name": _wrap(words),
         "base": 0.0,
         "height": level[stage],
         "end": level[stage],
-        "total": True,
         "colour": STAGE[stage],
         "hatch": "",
         "label": f"<b>{number(stages[stage])}</b>{'' if span and ends[1] <= HIGHEST else between}",
-        "hover": f"{words}: {number(stages[stage])}{between}",
+        "hover": f"{words}: {number(stages[stage])}{between.replace('<br>', ' ')}",
         "error": (max(level[stage] - ends[0], 0.0), max(min(ends[1], HIGHEST) - level[stage], 0.0)),
     }
 
 
-def _above(stage: str, level: Mapping[str, float]) -> float:
+def above(stage: str, level: Mapping[str, float]) -> float:
     """Level of the known stage before `stage`."""
     order = list(level)
     return level[order[order.index(stage) - 1]]
 
 
 def _drop(stage: str, level: Mapping[str, float], floor: str = "") -> dict[str, Any]:
-    return _step(part_words(stage, level, floor), stage, _above(stage, level), level[stage])
+    return _step(part_words(stage, level, floor), stage, above(stage, level), level[stage])
 
 
 def _step(words: str, stage: str, top: float, end: float) -> dict[str, Any]:
     label = percent(end - top, sign=True)
     return {
-        "x": _wrap(words, 13),
+        "name": _wrap(words),
         "base": min(top, end),
         "height": abs(top - end),
         "end": end,
-        "total": False,
         "colour": STAGE[stage],
         "hatch": HATCH[stage],
         "label": label,
@@ -223,89 +227,16 @@ def _effects(shares: Sequence[Mapping[str, Any]], level: Mapping[str, float]) ->
     for share in known:
         what, _, place = label_title(share["effect"], short=True).partition(" · ")
         drop = _step(text(f"{what} {place}"), "with_effects", start, start - whole * share["share"] / total)
-        out.append(drop | {"x": _wrap(text(what, 30), 13) + (f"<br>{text(place, 14)}" if place else "")})
+        out.append(drop | {"name": _wrap(text(f"{what} {place}".strip(), 38))})
         start = out[-1]["end"]
     return out
 
 
-def _wrap(words: str, width: int) -> str:
+def _wrap(words: str, width: int = 21) -> str:
+    """Break words into lines of fewer than `width` characters, as far as spaces allow."""
     lines = [""]
     for word in words.split(" "):
         if lines[-1] and len(lines[-1]) + len(word) >= width:
             lines.append("")
         lines[-1] = f"{lines[-1]} {word}".strip()
     return "<br>".join(lines)
-
-
-def horizons(rows: Sequence[Mapping[str, Any]], effects: bool = True) -> dict[str, Any] | None:
-    """Each horizon's squared gap as one bar of 100 %, cut into what closes which part."""
-    known = [(str(r.get("name", "")), r.get("floor", ""), squares(r, effects)) for r in rows]
-    known = [row for row in known if row[2]][::-1]
-    if len(known) < 2:
-        return None
-    names = [text(name) for name, _, _ in known]
-    cuts = [_cuts(level, floor) for _, floor, level in known]
-    parts = list(dict.fromkeys(key for key in ORDER if any(key in c for c in cuts)))
-    data = []
-    for words, stage in parts:
-        sizes, hatch = [c.get((words, stage), 0.0) for c in cuts], HATCH[stage] if words != LAST[0] else ""
-        data.append(
-            {
-                "type": "bar",
-                "orientation": "h",
-                "y": names,
-                "x": sizes,
-                "name": words,
-                "width": 0.6,
-                "marker": {
-                    "color": STAGE[stage],
-                    "line": {"color": "white", "width": 1},
-                    "pattern": {"shape": hatch, **OVER},
-                },
-                "text": [percent(s) if s > 0.045 else "" for s in sizes],
-                "textposition": "inside",
-                "insidetextanchor": "middle",
-                "textangle": 0,
-                "constraintext": "none",
-                "textfont": {"color": "white" if stage in ("nominal", "with_effects") else INK, "size": 12},
-                "hovertemplate": f"{words}: %{{x:.1%}}<extra></extra>",
-            }
-        )
-    return figure(
-        data,
-        WIDTH,
-        98 + 34 * len(known),
-        barmode="stack",
-        showlegend=True,
-        margin={"l": 90, "r": 20, "t": 34, "b": 30},
-        xaxis=axis(tickformat=".0%", range=[0, 1.02], showgrid=False),
-        yaxis=axis(showgrid=False, ticks=""),
-        legend={
-            "orientation": "h",
-            "x": 0,
-            "y": 1.02,
-            "yanchor": "bottom",
-            "traceorder": "normal",
-            "font": {"size": 12},
-        },
-    )
-
-
-LAST = ("measurement noise", "noise_floor")
-ORDER = (
-    (PARTS["calibrated"], "calibrated"),
-    (PARTS["with_effects"], "with_effects"),
-    (PARTS["noise_floor"], "reducible_floor"),
-    *((words, "noise_floor") for words in FLOORS.values()),
-    LAST,
-)
-
-
-def _cuts(level: Mapping[str, float], floor: str) -> dict[tuple[str, str], float]:
-    """{(words, stage of the colour): part of one bar}; a stage that makes the gap larger takes no part of it."""
-    out = {}
-    for stage in (s for s in PARTS if s in level):
-        words = part_words(stage, level, floor)
-        key = (words, "reducible_floor" if words == PARTS["noise_floor"] else stage)
-        out[key] = max(_above(stage, level) - level[stage], 0.0)
-    return out | ({LAST: level["noise_floor"]} if "noise_floor" in level else {})

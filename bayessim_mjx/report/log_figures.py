@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from bayessim_mjx.logs.channel_units import RATES
 from bayessim_mjx.logs.views import Coverage, Excitation, Sheet, spectrum, thinned, velocity
 from bayessim_mjx.monitor.style import BLUE
 from bayessim_mjx.report.look import (
@@ -32,8 +33,8 @@ DARK = 0.45  # coherence from which on the colour is dark behind a number
 SCALE = [[0, "#ffffff"], [0.02, "#dbe9f4"], [0.3, "#6aaed6"], [1, "#08306b"]]
 
 
-def over_time(sheet: Sheet, channels: Sequence[str], most: int) -> dict[str, Any]:
-    """One panel for each channel, above each other; `most`: points of a line."""
+def over_time(sheet: Sheet, channels: Sequence[str], most: int, units: Mapping[str, str]) -> dict[str, Any]:
+    """One panel for each channel, above each other; `most`: points of a line; units: {channel: unit}."""
     data: list[dict[str, Any]] = []
     layout: dict[str, Any] = {}
     titles = []
@@ -64,13 +65,14 @@ def over_time(sheet: Sheet, channels: Sequence[str], most: int) -> dict[str, Any
         layout[layout_key(x)] = axis(anchor=y, showticklabels=x == last, **across)
         layout[layout_key(y)] = axis(anchor=x, domain=[1 - (k + 0.95) * high, 1 - (k + 0.26) * high], nticks=4)
         said = f"{TITLES[kind]} {name}" if kind in TITLES else channel
+        said += f" ({units[channel]})" if channel in units else ""
         titles.append(heading(text(said + (", slope of the position" if estimated else ""), 60), x, y))
     margin = {"l": 54, "r": 10, "t": 6, "b": 46}
     return figure(data, WIDTH, 60 + ROW * len(channels), least=PHONE, annotations=titles, margin=margin, **layout)
 
 
-def spectra(sheets: Sequence[Sheet], channels: Sequence[str]) -> dict[str, Any] | None:
-    """Amplitude densities of the channels of one joint."""
+def spectra(sheets: Sequence[Sheet], channels: Sequence[str], units: Mapping[str, str]) -> dict[str, Any] | None:
+    """Amplitude densities of the channels of one joint; units: {channel: unit}."""
     data, every, across = [], [], []
     for channel in channels:
         found = spectrum(sheets, channel)
@@ -80,6 +82,7 @@ def spectra(sheets: Sequence[Sheet], channels: Sequence[str]) -> dict[str, Any] 
         every += [v for v in found[1].tolist() if v > 0]
         across += found[0].tolist()
         label = f"{TITLES[stream]} {name}" if stream in TITLES else channel
+        label += f" ({units[channel]})" if channel in units else ""
         data.append(
             {
                 "type": "scatter",
@@ -96,7 +99,7 @@ def spectra(sheets: Sequence[Sheet], channels: Sequence[str]) -> dict[str, Any] 
     low = max(every) * 1e-6
     limits = [float(np.log10(max(min(every), low))) - 0.1, float(np.log10(max(every))) + 0.2]
     ticks = [10.0**p for p in range(int(np.ceil(limits[0])), int(np.floor(limits[1])) + 1)]
-    vertical = axis("unit / √Hz", type="log", range=limits, tickvals=ticks, ticktext=[f"{t:g}" for t in ticks])
+    shown = {"type": "log", "range": limits, "tickvals": ticks, "ticktext": [f"{t:g}" for t in ticks]}
     margin = {"l": 64, "r": 12, "t": 34, "b": 50}
     return figure(
         data,
@@ -105,7 +108,7 @@ def spectra(sheets: Sequence[Sheet], channels: Sequence[str]) -> dict[str, Any] 
         least=PHONE,
         showlegend=True,
         xaxis=log_axis("frequency (Hz)", across),
-        yaxis=vertical,
+        yaxis=axis("density (unit / √Hz)", **shown),
         margin=margin,
     )
 
@@ -115,8 +118,11 @@ def _digits(values: np.ndarray) -> list[float | None]:
     return [float(f"{v:.4g}") if np.isfinite(v) and v > 0 else None for v in values.tolist()]
 
 
-def covered(joint: str, found: Coverage, limits: tuple[float, float] | None, high: int) -> dict[str, Any]:
+def covered(
+    joint: str, found: Coverage, limits: tuple[float, float] | None, high: int, unit: str = ""
+) -> dict[str, Any]:
     """Rows by position and velocity, dark where there are many; dashed: the ends of the model's range."""
+    of_place, of_speed = (f" ({unit})", f" ({RATES[unit]})") if unit else ("", "")
     counts = np.where(found.counts > 0, np.sqrt(found.counts), np.nan)
     middle = [0.5 * (edges[1:] + edges[:-1]) for edges in (found.places, found.speeds)]
     values = [[None if np.isnan(v) else round(float(v), 2) for v in row] for row in counts]
@@ -146,8 +152,8 @@ def covered(joint: str, found: Coverage, limits: tuple[float, float] | None, hig
     ]
     margin = {"l": 60, "r": 12, "t": 30, "b": 48}
     shape = {
-        "xaxis": axis("position", nticks=6),
-        "yaxis": axis("velocity", nticks=6),
+        "xaxis": axis(f"position{of_place}", nticks=6),
+        "yaxis": axis(f"velocity{of_speed}", nticks=6),
         "shapes": shapes,
         "margin": margin,
     }

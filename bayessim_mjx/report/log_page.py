@@ -51,9 +51,10 @@ def render(shown: View, source: str) -> str:
         tiles=_tiles(shown.sheets),
         notes=[page(text) for text in shown.overview.notes],
         missing=[page(text) for text in shown.overview.missing],
-        over_time=_over_time(shown.sheets, joints, shown.pairs),
+        over_time=_over_time(shown, joints),
+        units=bool(shown.units),
         left=max(0, len(shown.sheets) - _files_shown(shown.sheets, joints)),
-        spectra=_spectra(shown.sheets, joints, shown.pairs),
+        spectra=_spectra(shown, joints),
         coverage=_coverage(shown, joints),
         excitation=log_figures.excited(found) if found is not None and np.isfinite(found.coherence).any() else None,
         strongest=_strongest(found),
@@ -103,9 +104,10 @@ def _channels(sheet: Sheet, joint: str, pairs: dict[str, list[str]]) -> list[str
     return [n for n in names if n in sheet.channels or n == f"qvel:{joint}"]
 
 
-def _over_time(sheets: Sequence[Sheet], joints: Sequence[str], pairs: dict[str, list[str]]) -> dict[str, Any]:
+def _over_time(shown: View, joints: Sequence[str]) -> dict[str, Any]:
     """Figures by log and by joint; channels of no joint in groups."""
     plans: list[tuple[tuple[str, str], Sheet, list[str]]] = []
+    sheets, pairs = shown.sheets, shown.pairs
     for sheet in sheets[: _files_shown(sheets, joints)]:
         used: set[str] = set()
         for joint in joints:
@@ -120,20 +122,20 @@ def _over_time(sheets: Sequence[Sheet], joints: Sequence[str], pairs: dict[str, 
     plans = plans[:PANELS]
     lines = max(sum(len(names) for _, _, names in plans), 1)
     most = int(np.clip(POINTS / lines, FEWEST, MOST))
-    figures = [(keys, log_figures.over_time(sheet, names, most)) for keys, sheet, names in plans if names]
+    figures = [(keys, log_figures.over_time(sheet, names, most, shown.units)) for keys, sheet, names in plans if names]
     return choice(("log", "channels"), figures)
 
 
-def _spectra(sheets: Sequence[Sheet], joints: Sequence[str], pairs: dict[str, list[str]]) -> dict[str, Any]:
-    figures = []
+def _spectra(shown: View, joints: Sequence[str]) -> dict[str, Any]:
+    figures, sheets, pairs = [], shown.sheets, shown.pairs
     for joint in joints[:MAPS]:
         names = dict.fromkeys(n for s in sheets for n in _channels(s, joint, pairs))
-        made = log_figures.spectra(sheets, list(names))
+        made = log_figures.spectra(sheets, list(names), shown.units)
         if made is not None:
             figures.append(((joint,), made))
     if not figures:
         names = dict.fromkeys(n for s in sheets for n in s.channels)
-        every = [(name, log_figures.spectra(sheets, [name])) for name in list(names)[:MAPS]]
+        every = [(name, log_figures.spectra(sheets, [name], shown.units)) for name in list(names)[:MAPS]]
         figures = [((name,), made) for name, made in every if made is not None]
     return choice(("channel",), figures) if figures else {"axes": [], "panels": []}
 
@@ -148,10 +150,13 @@ def _coverage(shown: View, joints: Sequence[str]) -> dict[str, Any]:
         if found is None:
             continue
         if len(maps) < MAPS:
-            maps.append(log_figures.covered(joint, found, limits, 300 if len(joints) <= FEW else 220))
-        span = f"{compact(found.low, 3)} to {compact(found.high, 3)}"
+            high = 300 if len(joints) <= FEW else 220
+            maps.append(log_figures.covered(joint, found, limits, high, shown.units.get(f"qpos:{joint}", "")))
+        place, speed = (shown.units.get(f"{stream}:{joint}", "") for stream in ("qpos", "qvel"))
+        span = f"{compact(found.low, 3)} to {compact(found.high, 3)} {place}".rstrip()
         share = percent(found.range_share) if found.range_share is not None else "–"
-        rows.append((joint, span, share, compact(found.fastest, 3), percent(found.rest), str(found.turns)))
+        fastest = f"{compact(found.fastest, 3)} {speed}".rstrip()
+        rows.append((joint, span, share, fastest, percent(found.rest), str(found.turns)))
     heads = ("joint", "positions", "share of its range", "fastest", "at rest", "reversals")
     return {"maps": maps, "table": _table(heads, rows), "left": max(0, len(rows) - len(maps))}
 

@@ -39,6 +39,7 @@ FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, s
 WIDTH = 960  # of the page's column on a wide screen and on paper, px
 COLUMN = WIDTH // 2 - 20  # of one of two columns side by side, px
 LEAST = 560  # px, of most figures on a narrow one
+NARROW = 320  # px, of figures that a phone shows whole
 
 
 def text(value: Any, length: int = 60) -> str:

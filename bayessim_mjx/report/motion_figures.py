@@ -9,6 +9,7 @@ from bayessim_mjx.quantities import finite, unit
 from bayessim_mjx.report.look import (
     DASH,
     FAINT,
+    NARROW,
     STAGE,
     WIDTH,
     axis,
@@ -67,6 +68,7 @@ def episodes(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         [lines, *dots],
         WIDTH,
         height,
+        least=NARROW,
         showlegend=True,
         margin={"l": 120, "r": 20, "t": 30, "b": 48},
         xaxis=log_axis("gap in noise standard deviations (log scale)", [v for s in stages for v in values[s]]),
@@ -96,8 +98,8 @@ def overlay(row: Mapping[str, Any], points: int = 2000) -> dict[str, Any]:
     return figure(
         _lines(stages),
         WIDTH,
-        430,
-        least=640,
+        470,
+        least=NARROW,
         showlegend=True,
         hovermode="x unified",
         shapes=ticks if len(ticks) <= 60 else [],
@@ -106,8 +108,8 @@ def overlay(row: Mapping[str, Any], points: int = 2000) -> dict[str, Any]:
         yaxis=axis(domain=[0.44, 1]),
         yaxis2=axis(domain=[0, 0.34], zeroline=True, zerolinecolor=FAINT, nticks=6),
         annotations=[heading(name + tail, "x", "y"), heading("measured − simulated" + tail, "x2", "y2")],
-        legend={"orientation": "h", "x": 1, "xanchor": "right", "y": 1.01, "yanchor": "bottom", "font": {"size": 12}},
-        margin={"l": 56, "r": 12, "t": 30, "b": 46},
+        legend={"orientation": "h", "x": 0, "y": -0.14, "yanchor": "top", "font": {"size": 12}},
+        margin={"l": 56, "r": 12, "t": 30, "b": 76},
     ) | {"columns": columns}
 
 

@@ -8,10 +8,12 @@ from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
 from bayessim_mjx.diagnosis.phrases.verdict import number as noise_sd
+from bayessim_mjx.diagnosis.phrases.verdict import with_effects
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.diagnosis.statistics import of_one
+from bayessim_mjx.effects.support.words import spelt
 from bayessim_mjx.quantities import count, finite
-from bayessim_mjx.report import gap_figures, marks, place_figures
+from bayessim_mjx.report import gap_figures, horizon_figures, marks, place_figures
 from bayessim_mjx.report.choice import choice
 from bayessim_mjx.report.look import STAGE
 from bayessim_mjx.report.words import (
@@ -33,11 +35,12 @@ from bayessim_mjx.report.words import (
 
 MOST_CANDIDATES = 20  # in the table; no source: a matter of style
 OPEN_WARNINGS = 3  # more are folded away; no source: a matter of style
+TINY = 1e-6  # in SI units: smaller values in the table of candidates are zeros of a fit; no source: a matter of style
 EFFECTS = STAGE["with_effects"]
 TILES = {
     "nominal": "as delivered",
     "calibrated": "after recalibration",
-    "with_effects": "with the effects",
+    "with_effects": "",  # `with_effects`
 }
 
 
@@ -52,7 +55,7 @@ def top(d: Diagnosis, folder: Path) -> dict[str, Any]:
         "sentences": parted(d)[0],
         "advice": verdict.advice,
         "command": command(d, folder),
-        "tiles": [{"words": TILES[s], "colour": STAGE[s], **_tile(d, s)} for s in shown],
+        "tiles": [{"words": TILES.get(s) or with_effects(d), "colour": STAGE[s], **_tile(d, s)} for s in shown],
         "warnings": len(d.warnings),
         "open": len(d.warnings) <= OPEN_WARNINGS,
     }
@@ -98,7 +101,7 @@ def how_far(d: Diagnosis) -> dict[str, Any]:
     start = next((k for k, (name, _) in enumerate(falls) if same and name == str(same[0]["name"])), 0)
     return {
         "choice": choice(["horizon"], [((name,), f) for name, f in falls], start),
-        "horizons": gap_figures.horizons(d.gap.horizons, bool(d.effects)),
+        "horizons": horizon_figures.horizons(d.gap.horizons, bool(d.effects)),
         "table": _table(d, [_stages_row(r, len(d.gap.physical)) for r in rows if finite(r.get("nominal"))]),
         "channels": _table(d, _channels(d)),
         "repeated": repeated(d),
@@ -240,10 +243,10 @@ def _own(candidate: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _value(name: str, value: Any) -> str:
-    words = name.rpartition(".")[2].replace("_", " ")
+    words = spelt(name.rpartition(".")[2])
     if isinstance(value, Mapping):
         return f"{words} {estimate(value.get('mean'), value.get('sd'), value.get('unit', ''))}"
-    return f"{words} {number(value)}"
+    return f"{words} {number(0 if finite(value) and abs(value) < TINY else value)}"
 
 
 def where(d: Diagnosis) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.tables import TIE
 from bayessim_mjx.quantities import finite
 from bayessim_mjx.report.look import TONES
-from bayessim_mjx.report.words import MISSING, between, closure, estimate, not_fitted, number, percent, quantity
+from bayessim_mjx.report.words import MISSING, between, closure, estimate, not_fitted, number, percent, quantity, signs
 
 BEST = 8  # candidates; no source: a matter of style
 NOT_FITTED = 6  # named for each reason; diagnosis.json has all; no source: a matter of style
@@ -36,10 +36,10 @@ def console(
         if folder is not None and (text := command(diagnosis, folder)):
             out.command("next", text)
         for warning in diagnosis.warnings:
-            out.warning(warning)
+            out.warning(signs(warning))
         _tables(out, diagnosis, (_effects, _parameters))
         for sentence in parted(diagnosis)[0]:
-            out.say(f"- {sentence}")
+            out.say(f"- {signs(sentence)}")
         _tables(out, diagnosis, (_places,))
         if diagnosis.verdict != "no_gap":  # shares of a gap that is noise say nothing
             _ranking(out, diagnosis)
@@ -70,8 +70,8 @@ def _tables(out: Console, d: Diagnosis, tables: tuple[Callable[[Diagnosis], Tabl
 
 def _first(d: Diagnosis) -> list[tuple[str, str]]:
     """Lines of (text, style) that a person sees first; the same order as on the page."""
-    lines = [(headline(d), "bold"), (gap_line(d.gap, bool(d.effects)), ""), (verdict_of(d).advice, "dim")]
-    return [(text, style) for text, style in lines if text]
+    lines = [(headline(d), "bold"), (gap_line(d), ""), (verdict_of(d).advice, "dim")]
+    return [(signs(text), style) for text, style in lines if text]
 
 
 def _effects(d: Diagnosis) -> Table:

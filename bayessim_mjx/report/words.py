@@ -97,12 +97,14 @@ def quantity(name: str, value: Estimate) -> tuple[str, str]:
 
 
 def not_fitted(d: Diagnosis, most: int | None = None) -> list[str]:
-    """`no gain at first order: Payload · link, ...` for each reason; at most so many of each."""
+    """`no gain at first order: Payload (link, tool), ...` for each reason; at most so many effects of each."""
     lines = []
     for reason, labels in d.not_fitted.items():
-        more = len(labels) - len(labels[:most])
-        named = ", ".join(label_title(label, short=True) for label in labels[:most])
-        lines.append(f"{reason}: {named}" + (f" and {more} more" if more else ""))
+        laws: dict[str, list[str]] = {}
+        for law, _, place in (label_title(label, short=True).partition(" · ") for label in labels):
+            laws.setdefault(law, []).append(place)
+        each = [f"{law} ({', '.join(at)})" if any(at) else law for law, at in laws.items()]
+        lines.append(f"{reason}: {quantities.listed(each, most=most)}")
     return lines
 
 
@@ -133,6 +135,6 @@ def between(low: Any, high: Any) -> str:
         return "not determined"
     ends = [percent(low), percent(high)]
     if ends[0] == ends[1] and low < high:
-        places = 1 - quantities.power(100 * (high - low))
+        places = min(1 - quantities.power(100 * (high - low)), 2)
         ends = [f"{quantities.fixed(100 * end, places)} %" for end in (low, high)]
-    return " – ".join(ends)
+    return " – ".join(dict.fromkeys(ends))  # one number where two decimals do not separate them

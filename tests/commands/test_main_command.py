@@ -52,7 +52,7 @@ def test_main_killed_and_resumed_equals_unkilled(toy: None, monkeypatch: Any, ca
         assert checkpoint_of(resumed, last) == checkpoint_of(whole, last), saves
         assert [c["evaluation"] for c in resumed.checkpoints] == [c["evaluation"] for c in whole.checkpoints]
         assert not repeated_events(resumed)
-        assert [json.loads(line)["round"] for line in (run.path / "rounds.jsonl").read_text().splitlines()] == [0, 1]
+        assert [json.loads(line)["round"] for line in (run.path / "rounds.jsonl").read_text().splitlines()] == [1, 2]
     capsys.readouterr()
     assert main.main(["--resume", str(whole.path), "--headless"]) == 0
     out = capsys.readouterr().out

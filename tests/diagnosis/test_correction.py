@@ -10,6 +10,7 @@ import pytest
 
 from bayessim_mjx import config, registry
 from bayessim_mjx.diagnosis import correction, result
+from bayessim_mjx.diagnosis.correction import Estimate
 from bayessim_mjx.diagnosis.fitting.robot import of_file, of_task
 from bayessim_mjx.diagnosis.summary import files
 from bayessim_mjx.effects.support import storage
@@ -236,3 +237,9 @@ def test_a_value_without_an_interval_is_as_wide_as_its_range(robot):
     (known,) = [p for p in correction.calibrated_of(found, robot.space).parameters if p.name == MASS]
     assert known.nominal == known.mean == 1.1 and known.prior == "gaussian"
     assert known.sd == pytest.approx((own.high - own.low) / 12**0.5)
+
+
+def test_an_estimate_prints_as_people_read_it():
+    """Inside of the dict that README prints, too."""
+    found = Estimate(0.119068, 0.00159, "N m")
+    assert str(found) == "0.1191 +- 0.0016 N m" and str({"level": found}) == "{'level': 0.1191 +- 0.0016 N m}"

@@ -76,7 +76,7 @@ def test_a_killed_search_goes_on_and_comes_to_the_same(setup, counted_whole, tmp
     (whole, cost), counted = counted_whole, itertools.count()
 
     def say(text, done, total):
-        if text == "polishing" and next(counted) == 1:
+        if text == "final fits" and next(counted) == 1:
             raise Killed
 
     simulator = setup.fitter.simulator
@@ -106,7 +106,7 @@ def test_when_the_time_is_over_the_verdict_rests_on_what_is_fitted(setup, counte
     simulator, at = setup.fitter.simulator, {"now": 0.0}
 
     def say(text, done, total):
-        if text == "polishing" and "rollouts" not in at:
+        if text == "final fits" and "rollouts" not in at:
             at.update(now=1e9, rollouts=simulator.rollouts)
 
     short = searched(setup, say, seconds=1.0, now=lambda: at["now"])

@@ -191,7 +191,8 @@ def test_the_headline_says_partly_explained_and_what_remains_where():
     assert "shoulder" not in head and any(text.startswith("By joint") for text in rest)
     head, *rest = said("effects", [FRICTION], gap(0.0132))
     assert head == "The simulator lacks Coulomb friction at elbow."
-    assert rest[-1] == "Every joint is within its tolerance (closest: elbow, 0.76 deg of 1.1 deg, noise subtracted)."
+    said_so = "The closest is elbow: 0.76 deg above the noise, tolerance 1.1 deg (2.0 % of its motion)."
+    assert rest[-1] == f"Every joint is within its tolerance. {said_so}"
 
 
 def test_what_no_effect_explains_is_told_against_the_tolerance_too():

@@ -5,11 +5,13 @@ import re
 import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
 from bayessim_mjx import import_logs
 from bayessim_mjx.logs import views
+from bayessim_mjx.logs.channel_units import units_of
 from bayessim_mjx.logs.views import Sheet
 from tests.logs.importing import model_of
 from tests.logs.log_files import HEADER, rows, write
@@ -95,6 +97,26 @@ def test_the_page_has_every_section_and_loads_nothing(tmp_path: Path, capsys: py
     assert not re.search(r"(?:src|href)=\"(?:https?:)?//", own)
     for text in re.findall(r'<script type="application/json">(.*?)</script>', own):
         assert json.loads(text)["data"]
+
+
+def test_axes_have_the_units_of_the_model(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    show(capsys, logs(tmp_path), "--model", model_of(tmp_path), "--out", tmp_path / "show.html")
+    text = (tmp_path / "show.html").read_text()
+    for words in ("position shoulder (rad)", "velocity shoulder (rad/s)", "position (rad)", "velocity (rad/s)"):
+        assert words in text
+
+
+def test_units_of_channels() -> None:
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
+      <body name="base"><freejoint name="root"/><geom size=".1"/>
+        <body><joint name="turn"/><geom size=".1"/></body>
+        <body><joint name="rail" type="slide"/><geom size=".1"/></body>
+      </body></worldbody><actuator><motor name="m" joint="turn"/><motor name="geared" joint="turn" gear="9"/>
+      <position name="p" joint="rail" kp="5"/><velocity name="v" joint="turn" kv="2"/></actuator></mujoco>""")
+    found = units_of(model)
+    assert found["qpos:root[2]"] == "m" and "qpos:root[3]" not in found and found["qvel:root[5]"] == "rad/s"
+    assert (found["qpos:turn"], found["qvel:rail"]) == ("rad", "m/s") and "effort:turn" not in found
+    assert (found["ctrl:m"], found["ctrl:p"], found["ctrl:v"]) == ("N m", "m", "rad/s") and "ctrl:geared" not in found
 
 
 def test_without_a_model_columns_are_shown_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -75,4 +75,4 @@ def test_logs_check_shows_them_and_the_effect_that_has_them(tmp_path, capsys):
 def test_stamps_in_ns_since_1970_and_one_end_alone_are_said(tmp_path, capsys):
     sent, _ = stamps("gamma")
     out = checked(tmp_path, {"sent:measurement": sent}, capsys)
-    assert "sent:measurement tells no delay without received:measurement" in out
+    assert "sent:measurement gives no delay without received:measurement" in out

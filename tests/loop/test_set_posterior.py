@@ -34,7 +34,7 @@ def test_where_sets_cannot_be_simulated_the_product_is_kept_and_the_reason_told(
     product = state.domain
     for state_, why in [
         (dataclasses.replace(state, round=state.round + 1), "made by other policies"),
-        (state, "have told nothing yet"),
+        (state, "have no result yet"),
     ]:
         answer, found = set_posterior.use_set_network(Round(parts, state_, None, None, None), Answer(product))
         assert answer.posterior is product and answer.source == "product" and not found.fields

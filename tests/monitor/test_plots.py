@@ -197,6 +197,15 @@ def test_predictive_shows_the_worst_explained_channels_first():
     assert overlaps(figure) == [] and outside(figure) == []
 
 
+def test_few_channels_keep_their_places_from_round_to_round():
+    time = np.linspace(0, 2, 50)
+    real = {"a": np.sin(time), "b": np.cos(time)}
+    for off in ({"a": 1.0, "b": 0.0}, {"a": 0.0, "b": 1.0}):
+        simulated = {name: r + off[name] + np.array([[-0.1], [0.0], [0.1]]) for name, r in real.items()}
+        titles = [axes.get_title(loc="left") for axes in plots.predictive(time, real, simulated).axes]
+        assert [title[0] for title in titles] == ["a", "b"]
+
+
 def test_a_band_that_would_hide_under_the_line_is_drawn_about_the_median():
     """A posterior of a good fit: 100 % inside of a band that nobody could see."""
     rng, time = np.random.default_rng(0), np.linspace(0, 1, 30)

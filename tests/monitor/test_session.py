@@ -113,6 +113,6 @@ def test_a_resumed_run_films_at_the_next_interval_and_the_posterior_it_had(tmp_p
 
 def test_rounds_that_come_again_are_dropped(tmp_path, filmed):
     file = tmp_path / session.ROUNDS
-    file.write_text('{"round": 0}\n{"round": 1}\n3\n{"rou')
+    file.write_text('{"round": 1}\n{"round": 2}\n3\n{"rou')
     watch(tmp_path, filmed, start=state(1, 4, posterior(0.75)), resumed_at=3).close()
-    assert file.read_text() == '{"round": 0}\n' and not list(tmp_path.glob(".*.tmp"))
+    assert file.read_text() == '{"round": 1}\n' and not list(tmp_path.glob(".*.tmp"))

@@ -55,14 +55,15 @@ def test_without_a_gap_no_candidate_is_ranked_on_the_terminal():
 
 
 def test_what_was_not_fitted_is_listed_with_the_reason(tmp_path):
-    labels = [f"payload@link{i}" for i in range(9)]
+    labels = [f"payload@link{i}" for i in range(3)] + [f"law_{i}@link0" for i in range(9)]
     found = dataclasses.replace(fake.full(), not_fitted={"no time left": labels, "no gain at first order": ["x@y"]})
     file = io.StringIO()
     report.console(found, file=file)
     text = " ".join(file.getvalue().split())
-    assert "not fitted, no time left: Extra payload · link0" in text and "link5 and 3 more" in text
+    assert "not fitted, no time left: Extra payload (link0, link1, link2), Law 0 (link0)" in text
+    assert "Law 4 (link0) and 4 more" in text
     page = report.write(found, tmp_path).read_text()
-    assert "no gain at first order: X · y" in page and "link8" in page
+    assert "no gain at first order: X (y)" in page and "Law 8 (link0)" in page
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)

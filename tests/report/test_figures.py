@@ -9,10 +9,10 @@ STAGES = {"nominal": 4.0, "calibrated": 2.0, "with_effects": 1.0, "noise_floor":
 def test_a_wide_interval_leaves_room_for_the_bars():
     """Twice the gap is four times its square, far above what is drawn; the label has it then."""
     drawn = gap_figures.waterfall(STAGES | {"ci": {"nominal": (3.0, 8.0)}}, [])
-    assert drawn["layout"]["yaxis"]["range"][1] < 1.1 * gap_figures.HIGHEST + 1e-9
-    first = next(t for t in drawn["data"] if "error_y" in t)["error_y"]["array"][0]
+    assert drawn["layout"]["xaxis"]["range"][1] < 1.5 * gap_figures.HIGHEST
+    first = next(t for t in drawn["data"] if "error_x" in t)["error_x"]["array"][0]
     assert abs(first - (gap_figures.HIGHEST - 1.0)) < 1e-9
-    assert drawn["layout"]["annotations"][0]["text"] == "<b>4.00</b> (3.00 to 8.00)"
+    assert drawn["layout"]["annotations"][0]["text"] == "<b>4.00</b><br>(3.00 to 8.00)"
     narrow = gap_figures.waterfall(STAGES | {"ci": {"nominal": (3.0, 5.0)}}, [])
     assert narrow["layout"]["annotations"][0]["text"] == "<b>4.00</b>"
 
@@ -20,3 +20,13 @@ def test_a_wide_interval_leaves_room_for_the_bars():
 def test_a_figure_beside_a_table_is_no_wider_than_its_column():
     drawn = rival_figures.importance([{"input": "hinge speed", "importance": 2.0}])
     assert drawn["width"] == drawn["least"] == COLUMN
+
+
+def test_the_waterfall_fits_a_phone():
+    """Names stand left of the rows, in lines that are no longer than their margin; nothing is cut at 360 px."""
+    shares = [{"effect": "direction_dependent_friction@left_front_shoulder", "share": 1.0}]
+    drawn = gap_figures.waterfall(STAGES, shares)
+    names = drawn["layout"]["yaxis"]["ticktext"]
+    assert drawn["least"] <= 332 and names[0] == "as delivered" and len(names) == len(drawn["data"][0]["y"])
+    assert all(len(line) <= 24 for name in names for line in name.split("<br>"))
+    assert all(t["orientation"] == "h" for t in drawn["data"] if t["type"] == "bar")

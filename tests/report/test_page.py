@@ -210,7 +210,7 @@ def test_no_bar_is_longer_than_its_scale(tmp_path):
     for k in range(len(worse)):
         assert sum(t["x"][k] for t in stacked[0]["data"]) <= 1.0 + 1e-9
     falls = [t for f in page.figures for t in f["data"] if t["type"] == "bar" and "base" in t]
-    assert falls and max(b + y for t in falls for b, y in zip(t["base"], t["y"], strict=True)) <= 1.0 + 1e-9
+    assert falls and max(b + y for t in falls for b, y in zip(t["base"], t["x"], strict=True)) <= 1.0 + 1e-9
     assert "249" not in page.text and "none, it is worse" in page.text
 
 
@@ -283,3 +283,10 @@ def test_a_verdict_has_the_colour_of_the_terminal(verdict, tmp_path):
     assert f"--tone: {on_page};" in report.write(fake.bare(verdict), tmp_path).read_text(encoding="utf-8")
     others = [page for terminal, page in TONES.values() if terminal == on_terminal]
     assert set(others) == {on_page}
+
+
+def test_a_robot_of_one_joint_has_no_table_of_shares(tmp_path):
+    """`hinge 100 % (100 % - 100 %)` says nothing."""
+    whole = fake.full()
+    page = rendered(dataclasses.replace(whole, where=whole.where[:1]), tmp_path)
+    assert f"All of it is at {whole.where[0].channel}" in page.text and "share of the squared gap" not in page.text

@@ -111,7 +111,8 @@ def test_an_interval_that_says_nothing_is_not_told_in_numbers(span, said):
 
 def test_the_ends_of_an_interval_of_shares_never_look_the_same():
     assert words.between(0.96, 0.999) == "96 % – 99.9 %"
-    assert words.between(0.99963, 1.0) == "99.963 % – 100.000 %"
+    assert words.between(0.99963, 1.0) == "99.96 % – 100.00 %"
+    assert words.between(0.999988, 1.0) == "100.00 %"
     assert words.between(float("nan"), 1.0) == ""
 
 

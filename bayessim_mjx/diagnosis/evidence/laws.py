@@ -209,7 +209,13 @@ def by_effects(state: SearchState, answer: Model, say: Progress = lambda text, d
     some = sorted(some, key=lambda label: -likely[label][0][0].absorbed)[: EFFORT.batch]
     plans = [(s.candidate, point) for label in some for s, point in likely[label][: EFFORT.points]]
     own = looked_at(answer.fit, state.settings.screened)
-    columns = simulated(state.fitter, answer.fit, plans, own, lambda _, done, all_: say("hidden", done, all_))
+    columns = simulated(
+        state.fitter,
+        answer.fit,
+        plans,
+        own,
+        lambda _, done, all_: say("masked effects", done, all_),
+    )
     found = judged(state.fitter, answer.fit, columns, own)
     return tuple(label for label, each in found.items() if min(s.absorbed for s, _ in each) > HIDDEN)
 

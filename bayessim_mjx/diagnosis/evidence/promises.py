@@ -208,7 +208,9 @@ def around(weighing: Weighing, key: Key, say: Progress) -> list[Plan]:
         labels = list(dict.fromkeys(c.candidate.label for c in columns))[: EFFORT.batch]
         plans = [(c.candidate, c.point) for c in columns if c.candidate.label in labels]
         own = looked_at(fit, state.settings.screened)
-        columns = [*simulated(state.fitter, fit, plans, own, lambda _, done, total: say("second look", done, total))]
+        columns = [
+            *simulated(state.fitter, fit, plans, own, lambda _, done, total: say("screening again", done, total))
+        ]
     return _plans(weighing, key, Promises(weighing, whole, own, hyper, columns))
 
 

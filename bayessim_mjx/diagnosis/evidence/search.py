@@ -55,7 +55,7 @@ class Search:
             todo = self._todo(best)
             if not todo or self.state.settings.budget.over(TOGETHER):
                 break
-            self._fit(todo, f"round {made + 1}", TOGETHER)
+            self._fit(todo, f"sets of effects, round {made + 1}", TOGETHER)
             self._leading()
         for _ in range(EFFORT.rounds):
             before = self._order()[0]
@@ -64,7 +64,7 @@ class Search:
             best = self._order()[0]
             if best == before:
                 break
-            self._fit(self._todo(best), "around the new leading set", TOGETHER)  # it led in none of the rounds
+            self._fit(self._todo(best), "next to the best set", TOGETHER)  # it led in none of the rounds
             self._leading()
         self._smaller()
         self._at_one_place()
@@ -158,7 +158,7 @@ class Search:
             fewer = {k - {x}: k for k in near[::-1] for x in sorted(k) if k - {x} not in self.weighing.scored}
             if not fewer or self.state.settings.budget.over(LEAVING_OUT):
                 return
-            self._fit([Plan(key, np.inf, parent) for key, parent in fewer.items()], "dropping", LEAVING_OUT)
+            self._fit([Plan(key, np.inf, parent) for key, parent in fewer.items()], "leaving effects out", LEAVING_OUT)
 
     def _finish(self) -> None:
         """Bring the fits of the finalists to their end: of sets that may be the answer (`Effort.margin`)."""
@@ -179,7 +179,7 @@ class Search:
         best = self._order()[0]
         plans = [Plan(best - {x}, np.inf, best) for x in sorted(best) if len(best) > 1]
         if plans and not self.state.settings.budget.over(LEAVING_OUT):
-            self._fit(plans, "dropping", LEAVING_OUT)
+            self._fit(plans, "leaving effects out", LEAVING_OUT)
 
     def _possible(self) -> None:
         """Add to the answer one effect that may do the work of a known parameter.
@@ -197,7 +197,7 @@ class Search:
             for s in sorted(stand_ins(self.state, model), key=lambda s: -s.nats)[: EFFORT.sets[0]]
         ]  # fmt: skip
         if plans and not self.state.settings.budget.over(TOGETHER):
-            self._fit(plans, "beside known parameters", TOGETHER)
+            self._fit(plans, "with known parameters", TOGETHER)
 
     def _at_one_place(self) -> None:
         """Try special cases where the laws that contain them came to rest: with the rest neutral both are one model.

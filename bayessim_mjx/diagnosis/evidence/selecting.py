@@ -187,7 +187,7 @@ def _subsets(state: SearchState, answer: Model, say: Progress) -> dict[Key, Mode
             if own not in state.models and parent is not None:
                 kept = tuple(e for e in parent.effects if e.label in own)
                 entries[own] = ([cut_back(state, parent, kept)], kept)
-        fit_entries(state, entries, "dropping", say, LEAVING_OUT)
+        fit_entries(state, entries, "leaving effects out", say, LEAVING_OUT)
     known = itertools.chain.from_iterable(itertools.combinations(every, n) for n in range(len(every) + 1))
     found = {frozenset(own): state.models.get(frozenset(own)) for own in known}
     return {own: model for own, model in found.items() if model is not None} if all(found.values()) else {}

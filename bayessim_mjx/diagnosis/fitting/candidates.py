@@ -156,11 +156,7 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
                 continue
             except UserError as error:
                 whys.append(str(error))
-        why = (
-            whys[0].removeprefix(f"{kind.name}: ")
-            if found
-            else f"no {kind.kind} here that could carry it and was excited"
-        )
+        why = whys[0].removeprefix(f"{kind.name}: ") if found else f"these logs excite no suitable {kind.kind}"
         if found or not kind.floats:
             without.setdefault(why, []).append(kind.name)
     names = [scales.model.joint(int(j)).name for j in scales.model.dof_jntid]

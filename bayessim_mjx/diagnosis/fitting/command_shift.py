@@ -78,7 +78,7 @@ class Shift:
 
     def sentence(self, period: float) -> str:
         """Return the finding; period: s between rows of the log."""
-        text = f"commands look shifted by {1e3 * self.late:+.2g} ms (+- {1e3 * self.error:.1g} ms)"
+        text = f"commands seem shifted by {1e3 * self.late:+.2g} ms (+- {1e3 * self.error:.1g} ms)"
         if self.late > 0:
             why = "they act later than the log says. Drives and sensors need such a time, or the time stamps are late"
             mend = f"`commands_late: {self.late:.4g}` beside the logs takes late time stamps out"

@@ -127,12 +127,9 @@ class Discretisation:
         if self.limit is None or not (over := self.left[:nv] / self.limit).max() > 1:
             return []
         at, step = int(np.argmax(over)), 1e3 * self.timestep / self.factor
-        text = (
-            f"the simulator cannot be made fine enough: sub-steps of {step:.2g} ms are still worth {self.left[at]:.2g}"
-        )
-        return [
-            f"{text} rad or m at {self.channels[at]}, where {self.limit[at]:.2g} may stay; smaller gaps are not seen"
-        ]
+        text = f"the simulator cannot be made fine enough: sub-steps of {step:.2g} ms still change the motion"
+        text += f" by {self.left[at]:.2g} rad or m at {self.channels[at]}, where {self.limit[at]:.2g} may stay"
+        return [f"{text}; smaller gaps are not seen"]
 
     def to_dict(self) -> dict[str, Any]:
         """For diagnosis.json: numbers by channel, in noise units and physical ones."""

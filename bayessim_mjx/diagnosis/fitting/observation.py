@@ -278,7 +278,7 @@ def _demand(ways: Sequence[tuple[Log, Way]], model: mujoco.MjModel) -> None:
         given = [f"qpos:{n}" for n in log.channels.qpos if f"qpos:{n}" not in log.absent]
         given += [f"qvel:{n}" for n, s in zip(log.channels.qvel, log.seen_speeds, strict=True) if s]
         raise UserError(
-            f"{log.name}: what was measured ({', '.join(given)}) does not tell the motion of {', '.join(names)}; "
+            f"{log.name}: the measurement ({', '.join(given)}) does not determine the motion of {', '.join(names)}; "
             "allowed: logs that measure these joints, or joints that they move"
         )
 

@@ -115,7 +115,7 @@ def noise_of(logs: Sequence[Log], raw: Sequence[Log], use_qvel: bool) -> tuple[A
     motion = np.sqrt(np.mean([np.mean(log.qvel**2, axis=0) for log in logs], axis=0))
     known, precise = np.isfinite(dofs), np.maximum(PRECISE * motion, 1e-14)
     if not (known | moved & use_qvel).any():
-        text = f"{raw[0].name}: no position shows {LEVELS} values in any log, so nothing tells the noise of the sensors"
+        text = f"{raw[0].name}: no position shows {LEVELS} values in any log, so the noise of the sensors is unknown"
         raise UserError(f"{text}; allowed: `quantum` or `sigma` in the logs' side YAML, or logs that move")
     seen, fast = (np.all([getattr(log, k) for log in logs], axis=0) for k in ("seen_dofs", "seen_speeds"))
     fast |= not any(log.absent for log in logs)
@@ -152,5 +152,5 @@ def not_compared(logs: Sequence[Log]) -> list[str]:
     names = [f"qpos:{n}" for n, off in zip(logs[0].channels.qvel, unknown, strict=True) if off]
     if not names:
         return []
-    text = f"{', '.join(names)}: fewer than {LEVELS} values in every log tell no noise, so nothing is compared there"
-    return [f"{text}; `quantum` or `sigma` in the logs' side YAML would tell it"]
+    text = f"{', '.join(names)}: fewer than {LEVELS} values in every log, so the noise is unknown there"
+    return [f"{text}; `quantum` or `sigma` in the logs' side YAML states it"]

@@ -71,9 +71,7 @@ def constant(log: Log, dt: float) -> Iterator[Finding]:
         yield Finding("warning", f"qpos:{joint} never moves: nothing can be said about this joint")
     for name, x in zip(log.actuators, log.ctrl.T, strict=True):
         if np.ptp(x) <= 1e-9 * max(1.0, float(np.abs(x).max())):
-            yield Finding(
-                "warning", f"ctrl:{name} never changes ({x[0]:.4g}): nothing can be said about what it causes"
-            )
+            yield Finding("warning", f"ctrl:{name} never changes ({x[0]:.4g}): its influence is unknown")
     for name, stream in log.streams.items():
         if name.startswith("effort:") and np.ptp(stream) == 0:
             yield Finding("warning", f"{name} never changes ({stream[0]:.4g}): it is not used")

@@ -12,7 +12,7 @@ from bayessim_mjx import effects as library
 from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.correction import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.selection.numbers import ODDS
-from bayessim_mjx.effects.support.words import words
+from bayessim_mjx.effects.support.words import spelt, words
 from bayessim_mjx.quantities import MOST, finite, listed, percent
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def quantity(name: str, value: Estimate) -> tuple[str, str]:
         sd = value.sd / value.mean**2 if finite(value.sd) else value.sd  # d(1/x) = dx / x^2
         turned = {"at least": "at most", "at most": "at least"}.get(value.bound, value.bound)
         return RECIPROCALS[name], _bounded(measured(1 / value.mean, sd, _turned(value.unit)), turned)
-    return name.replace("_", " "), _bounded(measured(value.mean, value.sd, value.unit), value.bound)
+    return spelt(name), _bounded(measured(value.mean, value.sd, value.unit), value.bound)
 
 
 def _bounded(text: str, bound: str) -> str:
@@ -274,57 +274,3 @@ def candidate_title(candidate: Mapping[str, Any]) -> str:
 def capital(text: str) -> str:
     """With a capital letter at the front."""
     return f"{text[:1].upper()}{text[1:]}"
-
-
-# Known parameters in words: at a bound, different between conditions, far from the data sheet
-
-
-STUCK = "At a bound: {named}. They stand in for something missing, or their ranges are too narrow."
-FAR = "Far from the data sheet: {named}."
-STANDS_FOR = (
-    "A wrong data sheet at {parameters} moves the robot in these logs as {effects} would. --accuracy states "
-    "the accuracy of the data sheet."
-)
-
-
-def stuck(value: float) -> str:
-    """Of a known parameter at its bound."""
-    return f"is at its bound {value:.4g}: it stands in for something missing, or its range is too narrow"
-
-
-def moves(spread: float, groups: int, blocks: bool = False) -> str:
-    """Of a known parameter that differs between operating conditions; said in 3 % of checks with nothing hidden."""
-    where = "parts of the log" if blocks else "operating conditions"
-    return f"differs between {where} (sd {spread:.3g} over {groups}): something may be missing"
-
-
-def far_from_data_sheet(value: float, away: float) -> str:
-    """Of a known parameter whose accuracy was stated."""
-    return f"is {value:.4g}, {away:.1f} sd from the data sheet"
-
-
-def less_accurate(found: Mapping[str, tuple[float, float, float]]) -> str:
-    """Of kinds of known parameters, {kind: (median, low, high)}, whose accuracy nobody stated."""
-    each = [f"{kind} about {m:.0%} (90 %: {low:.0%} to {high:.0%})" for kind, (m, low, high) in found.items()]
-    return (
-        f"the model's numbers are less accurate than usual: {', '.join(each)}; the intervals allow for it; "
-        "--accuracy fixes it"
-    )
-
-
-def remarks(known: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return a sentence for each suspect parameter, but one for all at a bound and one for all far off."""
-    bound = {name: p for name, p in known.items() if p.get("at_bound")}
-    far = {name: p for name, p in known.items() if p.get("data_sheet")}
-    texts = [f"{name} {p['structural']}." for name, p in known.items() if p["structural"] and name not in bound]
-    if len(bound) == 1:
-        texts += [f"{name} {p['structural']}." for name, p in bound.items()]
-    elif bound:
-        texts.append(STUCK.format(named=listed([f"{name} {p['mean']:.4g}" for name, p in bound.items()])))
-    if len(far) == 1:
-        texts += [f"{name} {p['data_sheet']}." for name, p in far.items()]
-    elif far:
-        texts.append(FAR.format(named=listed([f"{n} {p['mean']:.4g} ({p['away']:.1f} sd)" for n, p in far.items()])))
-    same = {name: p["same_as"] for name, p in known.items() if p.get("same_as")}
-    labels = [label for each in same.values() for label in each]
-    return texts + ([STANDS_FOR.format(parameters=listed(list(same)), effects=any_of(labels, MOST))] if same else [])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,10 @@ from bayessim_mjx.diagnosis.logcheck.drives import LEAST
 from bayessim_mjx.diagnosis.logcheck.links import Channel
 from bayessim_mjx.diagnosis.phrases.effects import CLEAR, any_of, measured, multiplied, titled
 from bayessim_mjx.diagnosis.request import Tolerance
+from bayessim_mjx.diagnosis.result import Gap
+from bayessim_mjx.diagnosis.selection.numbers import RELEVANCE
+from bayessim_mjx.diagnosis.statistics import of_one, of_rms
+from bayessim_mjx.effects.support.words import spelt
 from bayessim_mjx.odometry.base import Base
 from bayessim_mjx.odometry.stand import Stand
 from bayessim_mjx.quantities import EXACT, MOST, estimate, extent, finite, listed, number, percent
@@ -110,6 +115,25 @@ def whole_logs(
         text = f"{seen} of {len(names)} whole logs are simulated with parameters fitted to them"
         out.append(f"{text}: these errors are in sample")
     return out
+
+
+def not_tried(short: Mapping[str, Any] | None) -> str:
+    """Parts of the search that the time was too short for."""
+    if not short:
+        return ""
+    text = f"In {short['minutes']:.3g} minutes not everything was tried: no time for {listed(short['parts'])}."
+    before = f" Before the search, reading the logs and compiling took {short['before']:.2g} of them."
+    return text + before * bool(short["before"])
+
+
+def horizon_warning(far: Gap) -> list[str]:
+    """Warn of a share closed that changes with the horizon: of one horizon its interval lies above another's."""
+    loud = [row for row in far.horizons if not of_one(row["calibrated"] ** 2).at_noise]
+    ends = [[of_rms(row["calibrated"], level).closed for level in row["ci"]["with_effects"]] for row in loud]
+    differ = len(loud) > 1 and max(least for _, least in ends) > min(most for most, _ in ends) + RELEVANCE.share
+    closed = {row["name"]: of_rms(row["calibrated"], row["with_effects"]).closed for row in loud}
+    each = [f"{percent(share) if share > 0 else 'none'} ({name})" for name, share in closed.items()]
+    return [f"the share of the gap that is closed depends on the horizon: {', '.join(each)}"] if differ else []
 
 
 def _some(few: Sequence[str], names: Sequence[str]) -> str:
@@ -244,8 +268,6 @@ def _mechanism(look: Look) -> str:
 def _proposal(p: Proposal) -> str:
     each = [(k, v, sd if (sd := p.deviations[k]) < 1e6 else None) for k, v in p.parameters.items() if v]
     own = p.term.modelled
-    numbers = ", ".join(
-        multiplied(own[k], v, sd) if k in own else f"{k.replace('_', ' ')} {measured(v, sd)}" for k, v, sd in each
-    )
+    numbers = ", ".join(multiplied(own[k], v, sd) if k in own else f"{spelt(k)} {measured(v, sd)}" for k, v, sd in each)
     rivals = any_of(p.rivals, MOST)
     return f"first guess: {titled(p.term.effect, p.term.where)}: {numbers}{f'; or {rivals}' if rivals else ''}"

@@ -6,13 +6,14 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from bayessim_mjx.diagnosis.phrases import effects, residual
 from bayessim_mjx.diagnosis.phrases import effects as named
+from bayessim_mjx.diagnosis.phrases import notes, parameters, residual
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
-from bayessim_mjx.diagnosis.selection.numbers import ODDS
+from bayessim_mjx.diagnosis.selection.numbers import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
 from bayessim_mjx.quantities import MOST, extent, finite, listed, percent
 
+SHARES = ("predicted", "realised", "elsewhere")  # of `Gap.closed`; effects that widen the gap close none
 HEADS = {
     "no_gap": "No gap above the noise: the logs differ from the simulator by {nominal}.",
     "parameters": "Only parameters are off: recalibration reduces the gap from {nominal} to {calibrated}.",
@@ -25,6 +26,10 @@ PARTLY_HEAD = "Partly explained: {named}."
 PART = "The library explains only a part of the gap that recalibration leaves, {calibrated}."
 REST = "More than the tolerance remains at {beyond}."
 IMPERFECT = "No candidate closes the rest, {rest} of the squared gap: the law is not quite that of the real system."
+LEFT = (
+    "Of the squared gap above the noise {they} {leave} {rest}. The cause of this rest is unknown; it is within the "
+    "tolerance."
+)
 NEAREST = "Nearest effects of the library: {nearest}."
 LITTLE = "At most half is closed: {they} {explain} little of the gap."
 ON_TOP = "Beside {them} a force is missing: that force makes {remains} of the squared gap."
@@ -41,7 +46,7 @@ ELSEWHERE = (
     "the choice compares had seen every condition."
 )
 IN_SAMPLE = "These numbers are in sample: one log is one operating condition, and other conditions may differ."
-WITHIN = "Every joint is within its tolerance (closest: {within})."
+WITHIN = "Every joint is within its tolerance. The closest is {within}."
 PROBABLE = (
     "Probability among all fitted explanations: {own} for this one, {others}, {nothing} for the known parameters alone."
 )
@@ -79,10 +84,9 @@ def sentences(d: Diagnosis) -> list[str]:
     texts = [_head(d), *_how_far(d), *_doubts(d), coasting(far, bool(d.effects)), _probable(d), _behind(d)]
     ambiguous = [found for found in d.answers if len(found["members"]) > 1]
     texts += [SPLITS.format(name=d.next_experiment["name"])] if any(a["splits"] for a in ambiguous) else []
-    them = "it" if len(d.effects) == 1 else "them"
     members = {label for a in d.answers for m in a["members"] for label in m["effects"]}
     hidden = [label for label in d.hidden if label not in members]  # a class already says that they are not separated
-    their = "its" if len(d.effects) == 1 else "their"
+    them, their = ("it", "its") if len(d.effects) == 1 else ("them", "their")
     texts += [HIDDEN.format(them=them, their=their, hidden=named.any_of(hidden, MOST))] if hidden else []
     texts += _noise(d)
     if d.verdict == "unexplained" and basis.get("flexible"):
@@ -91,9 +95,9 @@ def sentences(d: Diagnosis) -> list[str]:
     if basis.get("efforts"):
         texts.append(f"By the logged efforts alone, {basis['efforts']}.")
     texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
-    texts += effects.remarks(d.parameters)
+    texts += parameters.remarks(d.parameters)
     texts += [named.not_on_offer(basis["tried"])] if d.verdict == "unexplained" and basis.get("tried") else []
-    return [text for text in [*texts, not_tried(basis.get("not_tried"))] if text]
+    return [text for text in [*texts, notes.not_tried(basis.get("not_tried"))] if text]
 
 
 def _head(d: Diagnosis) -> str:
@@ -103,16 +107,24 @@ def _head(d: Diagnosis) -> str:
         quoted = {"no_gap": far.nominal, "parameters": far.calibrated}.get(d.verdict)
         above = quoted is not None and not of_one(quoted**2).at_noise
         head = HEADS["no_gap"].partition(": ")[2] if above and d.verdict == "no_gap" else HEADS[d.verdict]
-        return named.capital((head + SMALL * above).format(**fill))
+        return named.capital((head + SMALL * above).format(**fill)) + _acts(d)
     if d.verdict == "unexplained":
         gap = of_rms(far.calibrated, far.with_effects)
         head = f"{PARTLY_HEAD} {REST}" if far.beyond else PART if gap.closed > gap.left else HEADS["unexplained"]
-        return head.format(named=named.lacking(d.effects), **fill)
+        return head.format(named=named.lacking(d.effects), **fill) + _acts(d)
     several = {a["effect"]: a for a in d.answers if len(a["members"]) > 1}
     open_ = [named.answer(e, several[label]) for e in d.effects if (label := f"{e.name}@{e.where}") in several]
     sure = [e for e in d.effects if f"{e.name}@{e.where}" not in several]
     parts = [named.capital(named.lacking(sure)) + "."] if sure else []
-    return " ".join([*parts, *open_, *([REST.format(**fill)] if far.beyond else [])])
+    parts += [*open_, *(parameters.far_from_model(d.parameters) if d.accuracy else ())]
+    return " ".join([*parts, *([REST.format(**fill)] if far.beyond else [])])
+
+
+def _acts(d: Diagnosis) -> str:
+    """Return the place of a force that is missing beside all effects; "" where none predicts the residual."""
+    force = d.basis.get("flexible") or {}
+    known = d.verdict == "unexplained" and force.get("joints") and residual.predicts(force)
+    return f" A force is missing at {listed(force['joints'], most=3)}." if known else ""
 
 
 def _fill(d: Diagnosis) -> dict[str, str]:
@@ -131,8 +143,9 @@ def _fill(d: Diagnosis) -> dict[str, str]:
         "shown": percent(of_rms(far.calibrated, far.with_effects).closed),
         "nested": "Chosen and fitted" if far.closed.get("nested") else "Fitted",
         "close": "closes" if one else "close",
+        "leave": "leaves" if one else "leave",
         "rest": percent(of_rms(far.calibrated, far.with_effects).left),
-        **{k: percent(far.closed.get(k)) for k in ("predicted", "realised", "elsewhere")},
+        **{k: percent(max(v, 0.0)) for k, v in far.closed.items() if k in SHARES and finite(v)},
     }
 
 
@@ -149,6 +162,8 @@ def _how_far(d: Diagnosis) -> list[str]:
             remains = basis.get("remains") or 0.0
             out += [ON_TOP.replace("{remains}", percent(remains))] if remains > 0 else []
         out += [IMPERFECT] if far.beyond and d.verdict != "unexplained" and left > 0 else []
+        loud = left > RELEVANCE.share and not of_one(far.with_effects**2).at_noise
+        out += [LEFT] if loud and not far.beyond and d.verdict != "unexplained" else []
         out += [PROMISED] if finite(far.closed.get("realised")) else []
         out += [ELSEWHERE] if finite(far.closed.get("elsewhere")) else []
     out += [IN_SAMPLE] if far.in_sample else []
@@ -211,15 +226,6 @@ def coasting(far: Gap, named: bool) -> str:
     return COASTS.format(coasting=number(far.coasting), calibrated=number(far.calibrated), more=more)
 
 
-def not_tried(short: Mapping[str, Any] | None) -> str:
-    """Parts of the search that the time was too short for."""
-    if not short:
-        return ""
-    text = f"In {short['minutes']:.3g} minutes not everything was tried: no time for {listed(short['parts'])}."
-    before = f" Before the search, reading the logs and compiling took {short['before']:.2g} of them."
-    return text + before * bool(short["before"])
-
-
 def _at_bound(effect: FoundEffect) -> bool:
     return any(v.bound not in ("", "off") for v in effect.parameters.values())
 
@@ -236,11 +242,16 @@ def stage(far: Gap, name: str) -> str:
     return f"{parts[0]} ({noises})" if parts else noises
 
 
-def gap_line(far: Gap, effects: bool) -> str:
+def gap_line(d: Diagnosis) -> str:
     """Return the three gap numbers on one line of the terminal (the page has tiles, `report.sections`)."""
-    words = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
-    known = [s for s in words if finite(getattr(far, s)) and (effects or s != "with_effects")]
-    return "Gap: " + ", ".join(f"{stage(far, s)} {words[s]}" for s in known) + "." if known else ""
+    words = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": with_effects(d)}
+    known = [s for s in words if finite(getattr(d.gap, s)) and (d.effects or s != "with_effects")]
+    return "Gap: " + ", ".join(f"{stage(d.gap, s)} {words[s]}" for s in known) + "." if known else ""
+
+
+def with_effects(d: Diagnosis) -> str:
+    """Name the stage with the effects: in a headline that names none they are the nearest ones."""
+    return "with the nearest effects" if d.verdict == "unexplained" and not d.gap.beyond else "with the effects"
 
 
 def _worst(far: Gap) -> list[str]:
@@ -267,8 +278,9 @@ def _within(far: Gap) -> str:
         return ""
     row = far.physical[name]
     noise, unit = row.get("noise", 0.0), row["unit"]
-    above = float(above_noise(row["with_effects"], noise))
-    return f"{name}, {extent(above, unit)} of {extent(max(row['tolerance'], noise), unit)}, noise subtracted"
+    above, limit = float(above_noise(row["with_effects"], noise)), max(row["tolerance"], noise)
+    part = f" ({percent(limit / row['motion'])} of its motion)" if row["motion"] else ""
+    return f"{name}: {extent(above, unit)} above the noise, tolerance {extent(limit, unit)}{part}"
 
 
 def _by_joint(far: Gap, effects: bool) -> str:
@@ -286,13 +298,3 @@ def _by_joint(far: Gap, effects: bool) -> str:
 def number(value: float) -> str:
     """Three digits, in plain notation."""
     return f"{value:.2f}" if value < 9.995 else f"{value:.1f}" if value < 99.95 else f"{value:.0f}"
-
-
-def horizon_warning(far: Gap) -> list[str]:
-    """Warn of a share closed that changes with the horizon: of one horizon its interval lies above another's."""
-    loud = [row for row in far.horizons if not of_one(row["calibrated"] ** 2).at_noise]
-    ends = [[of_rms(row["calibrated"], level).closed for level in row["ci"]["with_effects"]] for row in loud]
-    differ = len(loud) > 1 and max(least for _, least in ends) > min(most for most, _ in ends)
-    closed = {row["name"]: of_rms(row["calibrated"], row["with_effects"]).closed for row in loud}
-    each = [f"{percent(share) if share > 0 else 'none'} ({name})" for name, share in closed.items()]
-    return [f"the share of the gap that is closed depends on the horizon: {', '.join(each)}"] if differ else []

@@ -37,7 +37,7 @@ from bayessim_mjx.diagnosis.selection.screen import looked_at, part, screen
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings
 
 Array = NDArray[np.float64]
-POLISHING = "polishing"
+POLISHING = "final fits"
 # of a fit that goes on with new columns: steps that were refused on old ones would hold it, and its start states, back
 AFRESH: dict[str, Any] = {"history": (), "damping": Fit.damping, "reach": np.ones(1)}
 
@@ -261,7 +261,7 @@ def begin(
     say("compiling the simulator", 0, 1)
     nominal = fitter.begin(fitter.base)
     settings = replace(settings, budget=settings.budget.searching())
-    say("known parameters", 0, 1)
+    say("fitting the known parameters", 0, 1)
     began, before = settings.budget.now(), fitter.simulator.rollouts
     fit = nominal
     for _ in range(2):  # the second time from start states' columns of its own

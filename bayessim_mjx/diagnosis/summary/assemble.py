@@ -14,7 +14,7 @@ from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Where
 from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.phrases import notes, residual
-from bayessim_mjx.diagnosis.phrases.verdict import horizon_warning, sentences
+from bayessim_mjx.diagnosis.phrases.verdict import sentences
 from bayessim_mjx.diagnosis.request import length_unit
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
@@ -52,7 +52,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     known = own.mean[:base] + (finer.shift[:base] if finer else 0.0)
     over, where, proposal = found.part(Whole), found.part(Where), found.part(Experiment)
     far = how_far.with_whole(far, over, setup.tolerance) if over else far
-    notes = [*setup.warnings, *steps, *(over.notes if over else ()), *(horizon_warning(far) if effects else [])]
+    warned = [*setup.warnings, *steps, *(over.notes if over else ()), *(notes.horizon_warning(far) if effects else [])]
     more: dict[str, Any] = {"force_left": force_in_numbers(found, far)}
     more |= {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
     more |= {"experiments": proposal.details()} if proposal else {}
@@ -65,7 +65,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         gap=far,
         parameters=estimates.parameters(selection, model, sd, known),
         candidates=ranking(selection.state),
-        warnings=[*notes, *estimates.less_accurate(model, own.sheet), *found.warnings],
+        warnings=[*warned, *estimates.less_accurate(model, own.sheet), *found.warnings],
         next_experiment=experiment,
         versions=versions.of(PACKAGES),
         details=details(found) | more,

@@ -18,13 +18,14 @@ from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.phrases import effects as phrases
-from bayessim_mjx.diagnosis.phrases import effects as remarks
+from bayessim_mjx.diagnosis.phrases import parameters as remarks
 from bayessim_mjx.diagnosis.phrases.effects import CLEAR
 from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.selection import bounds, heldout
 from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.effects.support.actuators import OfGains, OfLoops
+from bayessim_mjx.effects.support.words import spelt
 
 Array = NDArray[np.float64]
 
@@ -137,7 +138,7 @@ def _effect(found: Findings, effect: Candidate, sd: Array, part: dict[str, Any])
             if deviation > UNIFORM * (c.high - c.low)
             else ""
         )
-        ends += [f"{word.replace('_', ' ')} {clause}"] if clause else []
+        ends += [f"{spelt(word)} {clause}"] if clause else []
     shared = _shared(effect, size_of(effect, model.fit.values[own], sd[own]), weighed, weights)
     return FoundEffect(
         name=effect.effect,

@@ -32,6 +32,7 @@ from bayessim_mjx.effects.support import native, storage
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.parameters import ParameterSpace
+from bayessim_mjx.progress import Show
 
 PRELIMINARY = "preliminary.json"  # results while the search goes on
 SEARCH = "search_so_far"  # folder of the fits
@@ -59,6 +60,10 @@ class Files(Observer):
     def progress(self, text: str, done: int, total: int) -> None:
         if self._progress is not None:
             self._progress(text, done, total)
+
+    def note(self, text: str) -> None:
+        if isinstance(self._progress, Show):
+            self._progress.line(f"note: {text}")
 
     def early(self, lines: Sequence[str]) -> None:
         if self._early is not None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import re
 
 from bayessim_mjx import effects as room
 from bayessim_mjx.effects.effect import Effect
@@ -48,6 +49,11 @@ def words(name: str) -> Words:
         return Words(plain, lacks=plain)
     noun = kind.noun or plain
     return Words(noun, kind.kind, kind.lacks or noun, kind.separates or _law(kind), kind.witness)
+
+
+def spelt(parameter: str) -> str:
+    """Return the name of a parameter in words: `com_x` -> `centre of mass x`."""
+    return re.sub(r"^com ", "centre of mass ", parameter.replace("_", " "))
 
 
 def _law(kind: type[Effect]) -> str:

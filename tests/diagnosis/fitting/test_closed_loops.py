@@ -48,7 +48,7 @@ def recorded(folder, xml, joint, drive=(0.4, 0.7), noise=NOISE):
         rows.append([k * PERIOD, data.ctrl[0], data.joint(joint).qpos[0] + noise * rng.normal()])
         mujoco.mj_step(model, data, round(PERIOD / model.opt.timestep))
     np.savetxt(folder / "a.csv", rows, delimiter=",", header=f"time,ctrl:drive,qpos:{joint}", comments="")
-    with pytest.warns(UserWarning, match="this motion is estimated from what was measured"):
+    with pytest.warns(UserWarning, match="this motion is estimated from the measurements"):
         (log,) = read_logs([folder / "a.csv"], model, partial=True)
     (done,), _ = observation.completed([log], model)
     return model, done

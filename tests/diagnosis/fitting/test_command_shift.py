@@ -118,7 +118,7 @@ def test_a_lead_is_moved_away_and_told_not_explained_by_an_effect(tmp_path):
     effects = ["actuator_delay", "viscous_friction", "joint_elasticity"]
     found = diagnose(nominal(tmp_path), logged_late(recorded(count=6, delay=0.017)), effects=effects)
     assert found.verdict == "no_gap" and not found.effects
-    (told,) = [w for w in found.warnings if "commands look shifted" in w]
+    (told,) = [w for w in found.warnings if "commands seem shifted" in w]
     assert "-3 ms" in told and "which no drive does" in told
     for parameter in found.parameters.values():
         assert parameter["mean"] == pytest.approx(1.0, abs=0.01)

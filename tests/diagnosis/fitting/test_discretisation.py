@@ -209,7 +209,7 @@ def test_what_is_left_beyond_the_tolerance_is_told():
     left = np.array([1e-3, 8e-3, 0.0, 0.0])
     given = (0.01, 8, 1.0, none, none, left, sigma, sigma, np.zeros(2, bool), ("a", "b"))
     (text,) = discretisation.Discretisation(*given, limit=np.full(2, 2e-3)).beyond()
-    assert "sub-steps of 1.2 ms are still worth 0.008 rad or m at b, where 0.002 may stay" in text
+    assert "sub-steps of 1.2 ms still change the motion by 0.008 rad or m at b, where 0.002 may stay" in text
     assert not discretisation.Discretisation(*given, limit=np.full(2, 1e-2)).beyond()
     assert not discretisation.Discretisation(*given).beyond()
 

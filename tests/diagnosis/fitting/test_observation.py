@@ -116,7 +116,7 @@ def unseen_hip(log: Log, model: mujoco.MjModel) -> Log:
 
 def test_what_the_logs_cannot_tell_is_refused_by_name():
     model = mujoco.MjModel.from_xml_string(APART)
-    with pytest.raises(UserError, match=r"run\.csv: .*\(qpos:shoulder\) does not tell the motion of elbow;"):
+    with pytest.raises(UserError, match=r"run\.csv: .*\(qpos:shoulder\) does not determine the motion of elbow;"):
         observation.completed([without(recorded(APART), "qpos:elbow")], model)
 
 

@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 
-from bayessim_mjx.diagnosis.phrases import advice, effects, notes, verdict
+from bayessim_mjx.diagnosis.phrases import advice, notes, parameters, verdict
 from bayessim_mjx.diagnosis.request import Tolerance
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect, Gap
 from bayessim_mjx.diagnosis.summary.estimates import answers
@@ -84,12 +84,14 @@ def every():
     quiet = {"nominal": 1.1, "calibrated": 1.0, "with_effects": 1.0}
     loud = {"nominal": 1.4, "calibrated": 1.3, "with_effects": 1.3}
     run = {"name": "chirp on hinge", "why": "run a chirp on hinge for 10 s", "file": "next_experiment.csv"}
-    stuck = {"mean": 0.8, "structural": effects.stuck(0.8), "at_bound": True, "data_sheet": ""}
+    stuck = {"mean": 0.8, "structural": parameters.stuck(0.8), "at_bound": True, "data_sheet": ""}
     far = {"mean": 1.2, "structural": "", "at_bound": False, "away": 4.0}
-    far |= {"data_sheet": effects.far_from_data_sheet(1.2, 4.0)}
-    moves = {"mean": 1.0, "structural": effects.moves(0.2, 3), "at_bound": False, "data_sheet": ""}
+    far |= {"data_sheet": parameters.far_from_data_sheet(1.2, 4.0)}
+    moves = {"mean": 1.0, "structural": parameters.moves(0.2, 3), "at_bound": False, "data_sheet": ""}
     same = {"mean": 1.0, "structural": "", "data_sheet": "", "same_as": ["viscous_friction@hinge"]}
     known = {"hip": stuck, "knee": stuck, "arm": far, "leg": far, "foot": moves, "toe": same}
+    plain = {"structural": "", "data_sheet": "", "nominal": 1.0}
+    heavier = {"arm_mass_mult": plain | {"mean": 1.43, "sd": 0.022}, "leg_mass_mult": plain | {"mean": 1.1, "sd": 0.01}}
     few = {"hip": stuck, "arm": far}
     short = {"minutes": 5.0, "before": 2.0, "parts": ["3 pairs"]}
     chance = {"answer": 0.9, "rivals": 0.08, "nothing": 1e-9}
@@ -106,6 +108,7 @@ def every():
         "one law at two joints": made("effects", [FRICTION, dataclasses.replace(FRICTION, where="elbow")]),
         "one log": made("effects", [FRICTION], gap(closed=ALONE, in_sample=True)),
         "a remainder": made("effects", [FRICTION], some),
+        "much is left within the tolerance": made("ambiguous", [FRICTION, PAYLOAD], gap(with_effects=6.0)),
         "an effect at its bound": made(
             "effects",
             [dataclasses.replace(END, sentence="Gap ends.")],
@@ -122,6 +125,7 @@ def every():
         ),
         "beside joints that keep their speed": made("unexplained", [GAIN], gap(with_effects=6.0, coasting=5.0)),
         "known parameters": made("effects", [FRICTION], parameters=known, builds_up=3.0),
+        "a heavier link": made("effects", [FRICTION], parameters=heavier, accuracy={"mass": {"low": 0.15}}),
         "one parameter": made("effects", [FRICTION], parameters=few, efforts="the motors follow"),
     }  # fmt: skip
 
@@ -145,8 +149,8 @@ def warnings():
         *notes.finer_steps([("hinge.delay", 0.012, 0.002, "s", 0.0002), ("mass", 1.0, 0.1, "kg", 0.1)]),
         *notes.whole_logs(names, names[:6], names[6:7], 2.4, away, 7, 3),
         *notes.whole_logs(names, names, [], 0.0, {}, 0, 0),
-        *verdict.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=rows)),
-        effects.less_accurate({"mass": (0.2, 0.1, 0.4)}),
+        *notes.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=rows)),
+        parameters.less_accurate({"mass": (0.2, 0.1, 0.4)}),
     ]
 
 

@@ -101,7 +101,8 @@ def _quoted(said: Said) -> Iterator[tuple[str, str]]:
     """Shares whose datum is known, and others, which must be some number of the result."""
     gap, basis, chance = said["gap"], said.get("basis") or {}, (said.get("basis") or {}).get("probability") or {}
     held = [h["closed"] for h in ((basis.get("flexible") or {}).get("held") or {}).values()]
-    closed, sheet = gap.get("closed") or {}, {k: share(*v) for k, v in _falls(said).items()}
+    shares = {k: max(v, 0.0) for k, v in (gap.get("closed") or {}).items() if isinstance(v, float)}
+    closed, sheet = shares, {k: share(*v) for k, v in _falls(said).items()}
     exact = {
         r"linear step predicted": [closed.get("predicted")],
         "in turn, the effect closes": [closed.get("realised")],
@@ -109,6 +110,8 @@ def _quoted(said: Said) -> Iterator[tuple[str, str]]:
         "leaves it out, the effect closes": [closed.get("elsewhere")],
         "leaves it out, the effects close": [closed.get("elsewhere")],
         r"closes the rest,": [1.0 - sheet["effects"]],
+        "the effect leaves": [1.0 - sheet["effects"]],
+        "the effects leave": [1.0 - sheet["effects"]],
         r"that force makes": [basis.get("remains")],
         "among all fitted explanations:": [chance.get("answer")],
         "for this one,": [chance.get("rivals")],
@@ -139,12 +142,14 @@ def _sizes(said: Said) -> Iterator[tuple[str, str]]:
     for e in said["effects"]:
         for name, p in e["parameters"].items():
             known.append((p["mean"], p["sd"]))
+            known += [(p["mean"] * m, p["sd"] and p["sd"] * m) for m in (e.get("modelled") or {}).values()]
             if name.startswith(("inverse", "slowness")) and p["mean"]:
                 known.append((1 / p["mean"], p["sd"] and p["sd"] / p["mean"] ** 2))
+    known += [(p["mean"], p["sd"]) for p in said["parameters"].values() if "sd" in p]
     for mean, sd, unit in re.findall(rf"({NUMBER}) \+- ({NUMBER}) ?(ms)?", text_of(said)):
         scale = IN_UNIT.get(unit, 1.0)
         if not any(rounds_to(m, mean, scale) and rounds_to(s, sd, scale) for m, s in known):
-            yield "size", f"{mean} +- {sd} {unit} is no effect's number".replace("  ", " ")
+            yield "size", f"{mean} +- {sd} {unit} is no effect's or parameter's number".replace("  ", " ")
 
 
 def _intervals(said: Said) -> Iterator[tuple[str, str]]:
@@ -189,7 +194,7 @@ def _verdict(said: Said) -> Iterator[tuple[str, str]]:
         yield "words", f"no gap above the noise, but {gap['nominal']:.2f} noise sd"
     left = 1.0 - share(*_falls(said)["effects"])
     open_ = name in ("effects", "ambiguous") and left > UNEXPLAINED and gap["with_effects"] > 1.2
-    if open_ and "covariance of" not in text:
+    if open_ and "covariance of" not in text and "cause of this rest is unknown" not in text:
         yield (
             "verdict",
             f"verdict {name}, but the effects leave {left:.0%} of the gap, {gap['with_effects']:.2f} noise sd",

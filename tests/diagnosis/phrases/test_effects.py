@@ -53,7 +53,8 @@ def test_an_estimate_is_printed_as_it_is_rounded_by_its_uncertainty(value, text)
         (effect("payload", "tool", mass=(0.99, 0.01, "kg"), com_x=(0.01, 0.1, "m")),
          "an extra payload at tool (mass 0.990 +- 0.010 kg)"),
         (effect("payload", "tool", mass=(0.99, 0.01, "kg"), com_x=(1.0, 0.1, "m"), com_y=(1.0, 0.1, "m")),
-         "an extra payload at tool (mass 0.990 +- 0.010 kg, com x 1.00 +- 0.10 m, com y 1.00 +- 0.10 m)"),
+         "an extra payload at tool (mass 0.990 +- 0.010 kg, centre of mass x 1.00 +- 0.10 m, "
+         "centre of mass y 1.00 +- 0.10 m)"),
         (effect("my_effect", "elbow"), "my effect at elbow"),
     ],
 )  # fmt: skip
@@ -67,7 +68,7 @@ def test_numbers_that_the_model_has_wrong_are_no_lack():
     centre = effect("inertial_parameters", "link", com_x=(0.01, 0.001, "m"), inertia=(1.0, 0.1, ""))
     assert effects.lacking([scale, height, centre]) == (
         "the sensor gain at j is 1.100 +- 0.020, not 1; the height of the ground is off by 0.0200 +- 0.0010 m; "
-        "the centre of mass and inertia at link is not the model's (com x 0.0100 +- 0.0010 m)"
+        "the centre of mass and inertia at link is not the model's (centre of mass x 0.0100 +- 0.0010 m)"
     )
 
 

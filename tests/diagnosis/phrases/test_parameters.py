@@ -1,7 +1,7 @@
 """What is remarked of known parameters, in sentences."""
 
-from bayessim_mjx.diagnosis.phrases import effects as phrases
-from bayessim_mjx.diagnosis.phrases.effects import remarks
+from bayessim_mjx.diagnosis.phrases import parameters as phrases
+from bayessim_mjx.diagnosis.phrases.parameters import remarks
 
 
 def parameter(mean: float, structural: str = "", away: float | None = None) -> dict:

@@ -5,7 +5,7 @@ import shlex
 
 import pytest
 
-from bayessim_mjx.diagnosis.phrases import advice, verdict
+from bayessim_mjx.diagnosis.phrases import advice, notes, verdict
 from bayessim_mjx.diagnosis.result import VERDICTS, Gap, Place
 from tests.diagnosis.phrases import cases
 from tests.diagnosis.phrases.cases import CLOSED, FRICTION, GAIN, LEVEL, PAYLOAD, gap, made
@@ -68,11 +68,18 @@ def test_a_member_of_a_class_is_not_called_hidden_as_well():
 
 
 def test_a_gap_within_the_noise_is_called_so():
-    assert verdict.gap_line(LEVEL, True) == (
+    assert verdict.gap_line(made("effects", [FRICTION])) == (
         "Gap: 1.2 deg (2.1 % of the motion, 21.4 noise sd) as delivered, 0.61 deg (1.1 % of the motion, 10.7 noise sd) "
         "recalibrated, 0.050 deg (0.087 % of the motion, 0.87 noise sd, within the noise) with the effects."
     )
-    assert "with the effects" not in verdict.gap_line(LEVEL, False)
+    assert "with the effects" not in verdict.gap_line(made("parameters"))
+
+
+def test_effects_that_the_headline_does_not_name_are_the_nearest():
+    far = dataclasses.replace(LEVEL, with_effects=6.0, closed=LEVEL.closed | {"realised": -0.03})
+    found = made("unexplained", [FRICTION], far)
+    assert "noise sd) with the nearest effects" in verdict.gap_line(found)
+    assert "in turn, the effect closes 0 %" in " ".join(found.sentences)
 
 
 EVERY = [
@@ -117,11 +124,11 @@ def test_a_closure_that_depends_on_the_horizon_is_flagged():
         {"name": n, "calibrated": c, "with_effects": w, "ci": {"with_effects": [w / 1.16, w * 1.16]}}
         for n, c, w in rows
     ]
-    (text,) = verdict.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons))
+    (text,) = notes.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons))
     assert text.endswith("depends on the horizon: 100 % (0.1 s), 97 % (0.5 s), 51 % (whole log)")
-    assert not verdict.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons[:2]))
+    assert not notes.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=horizons[:2]))
     nobody_knows = [row | {"ci": {"with_effects": [float("nan")] * 2}} for row in horizons]  # of one condition
-    assert not verdict.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=nobody_knows))
+    assert not notes.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=nobody_knows))
 
 
 ABOUT = {"model": "Pendulum", "data": ["my logs"]}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.phrases import effects as phrases
-from bayessim_mjx.diagnosis.phrases import verdict
+from bayessim_mjx.diagnosis.phrases import notes
 from bayessim_mjx.diagnosis.selection import successive_halving
 from bayessim_mjx.diagnosis.selection.numbers import ENDS, Budget, begun
 from bayessim_mjx.diagnosis.selection.search_state import Settings
@@ -38,7 +38,7 @@ def test_what_there_was_no_time_for_is_told_in_words():
     assert not_tried(tried({}, [])) == {}
     short = tried({}, [], ["a@h", "b@h"], {"single effects": 2, "2 effects": 30}, budget=Budget(120.0))
     told = "In 2 minutes not everything was tried: no time for 2 single effects and 30 models (2 effects)."
-    assert verdict.not_tried(not_tried(short)) == told
+    assert notes.not_tried(not_tried(short)) == told
 
 
 def test_parts_end_one_after_the_other_and_without_a_limit_never():
@@ -60,7 +60,7 @@ def test_parts_share_what_is_left_once_the_simulator_is_compiled():
     late = Budget(100.0, 0.0, lambda: 130.0).searching()
     assert late.fixed == 100 and all(late.over(part) for part in ENDS)
     assert begun(None).searching() == begun(None)
-    told = verdict.not_tried(not_tried(tried({}, [], ["a@h"], {}, budget=budget)))
+    told = notes.not_tried(not_tried(tried({}, [], ["a@h"], {}, budget=budget)))
     assert told.endswith("Before the search, reading the logs and compiling took 0.67 of them.")
 
 
