@@ -99,15 +99,6 @@ class Loops:
                     out[other] = lead
         return out
 
-    def opened(self, qpos: Array, seen: NDArray[np.bool_], loaded: mujoco.MjData) -> Array:
-        """`[2 nv]`, how far the joints that are not seen are from where closed constraints have them, for their loads.
-
-        loaded: in that state, after `mj_forward`.
-        """
-        out = np.zeros((2, self.model.nv))
-        out[:, ~seen] = np.array(yielding(loaded)) @ np.abs(np.linalg.pinv(self.at(qpos)[0][:, ~seen])).T
-        return out.ravel()
-
     def _near(self, qpos: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array] | None:
         """Return `closed` by Newton's method, and derivatives `[nv, nv]` of others by the seen; None where it fails."""
         step, last = np.full(1, np.inf), np.inf
@@ -129,15 +120,3 @@ class Loops:
         whole[which] = change
         mujoco.mj_integratePos(self.model, there, whole, 1.0)
         return there
-
-
-def yielding(data: mujoco.MjData) -> tuple[Array, Array]:
-    """(positions, speeds) `[m]` by which the equality constraints yield to their forces, after `mj_forward`.
-
-    A constraint of MuJoCo is a spring and a damper that a force f opens by R f: R f = -b v - k r, at rest or at a
-    steady speed (documentation of MuJoCo, Computation, constraint model).
-    """
-    own = np.flatnonzero(data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY))
-    load = np.abs(data.efc_R * data.efc_force)[own]
-    stiffness, damping = np.asarray(data.efc_KBIP).reshape(-1, 4)[own, :2].T
-    return load / stiffness, load / damping

@@ -25,7 +25,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.odometry import base
 from bayessim_mjx.physics import controllers
-from bayessim_mjx.physics.loops import Loops, yielding
+from bayessim_mjx.physics.loops import Loops
 
 Array = NDArray[np.float64]
 # rad or m, rad/s or m/s, of finite differences in doubles: the cube root of their precision balances the rounding of
@@ -110,21 +110,13 @@ def _with(log: Log, way: Way, model: mujoco.MjModel) -> Log:
 
 
 def _smoothed(log: Log, model: mujoco.MjModel) -> Way:
-    """Return the best of some sizes of what the model lacks; where constraints tell the motion, none is needed.
-
-    How exactly they tell it is a matter of the loads on them, as the model has them: MuJoCo's constraints are soft.
-    """
+    """Return the best of some sizes of what the model lacks; where constraints tell the motion, no model is needed."""
     noise, prior = np.concatenate([log.sigma_dofs, log.sigma_qvel]), np.repeat(PRIOR, model.nv)
-    stepper = Stepper(model, log)
-    if (bound := stepper.loops.followed(log.qpos, log.qvel, noise, log.seen_dofs)) is not None:
-        qpos, qvel, sd = bound
-        for row, (q, v) in enumerate(zip(qpos, qvel, strict=True)):
-            stepper.placed(q, v, row)
-            mujoco.mj_forward(stepper.model, stepper.data)
-            sd[row] = np.hypot(sd[row], stepper.loops.opened(q, log.seen_dofs, stepper.data))
-        known = (prior / np.maximum(sd.max(0), NUDGE)) ** 2 - 1
+    if (bound := Loops(model).followed(log.qpos, log.qvel, noise, log.seen_dofs)) is not None:
+        known = (prior / np.maximum(bound[2].max(0), NUDGE)) ** 2 - 1
         if (known > 1).all():
-            return Way(qpos, qvel, sd, known)
+            return Way(*bound, known)
+    stepper = Stepper(model, log)
     measured = _Measured.of(log)
     lacking = _accelerations(model, log)
     tried = [_Filter(stepper, log, measured, share * lacking) for share in SIZES]
@@ -307,14 +299,14 @@ class Stepper:
         span = float(self.log.time[row + 1] - self.log.time[row]) if span is None else span
         steps = max(1, int(np.ceil(span / self.longest - 1e-6)))
         self.model.opt.timestep = span / steps
-        command = self.placed(qpos, qvel, row)
+        command = self._at(qpos, qvel, row)
         for _ in range(steps):
             if self.loop is not None:
                 self.data.ctrl[:] = self.loop(command, self.data.qpos, self.data.qvel)
             mujoco.mj_step(self.model, self.data)
         return self.data.qpos.copy(), self.data.qvel.copy()
 
-    def placed(self, qpos: Array, qvel: Array, row: int) -> Array:
+    def _at(self, qpos: Array, qvel: Array, row: int) -> Array:
         """Return the command of a row; data in that state."""
         data, command = self.data, self.log.ctrl[row]
         if self.log.linear:
@@ -326,7 +318,7 @@ class Stepper:
     def bound(self, qpos: Array, qvel: Array, measured: _Measured) -> tuple[Array, Array, Array]:
         """Equality constraints at a state: (rows `[2 m, 2 nv]` of their derivatives, how far they are off, sd).
 
-        A constraint holds as exactly as the encoders' noise moves it and as it yields to its load in a step before.
+        A constraint holds as exactly as the encoders' noise moves it.
         """
         nv = self.nv
         J, off = self.loops.at(qpos)
@@ -335,8 +327,6 @@ class Stepper:
         noise = np.zeros(2 * nv)
         noise[measured.rows] = measured.sigma
         sd = np.maximum(np.concatenate([np.linalg.norm(J * n, axis=1) for n in (noise[:nv], noise[nv:])]), NUDGE)
-        yields = np.concatenate(yielding(self.data))
-        sd = np.hypot(sd, yields) if len(yields) == len(sd) else sd
         none = np.zeros_like(J)
         return np.block([[J, none], [none, J]]), np.concatenate([off, J @ qvel]), sd
 
@@ -356,7 +346,7 @@ class Stepper:
         """Return derivatives of the accelerations by the state `[nv, 2 nv]`."""
 
         def at(nudge: Array) -> Array:
-            self.placed(*self.moved(qpos, qvel, nudge), row)
+            self._at(*self.moved(qpos, qvel, nudge), row)
             mujoco.mj_forward(self.model, self.data)
             return np.array(self.data.qacc)
 
