@@ -24,7 +24,7 @@ _ALLOWED = {
 }
 KEYS = ("law", "kp", "kd", "limit", "scale", "note")  # note: for people
 NO_INTEGRAL = (
-    "allowed: 0 (no integral term is simulated), or what the loop puts out in the columns `ctrl:` with law: direct"
+    "allowed: 0 (no integral term is simulated), or the output of the loop in the columns `ctrl:`, with law: direct"
 )
 
 

@@ -43,7 +43,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # effects
     (
         "dry friction pushes on: level of the other direction", f"{EFFECTS}/support/friction.py",
-        "jnp.where(stop > level[i, 1], level[i, 1], stop))", "jnp.where(stop > level[i, 1], level[i, 0], stop))",
+        "jnp.where(asked > level[i, 1], level[i, 1], asked))", "jnp.where(asked > level[i, 1], level[i, 0], asked))",
         ("tests/effects/test_friction_effects.py", "-k", "by_direction"),
     ),
     (

@@ -113,7 +113,7 @@ def test_a_wrong_input_is_one_line_that_says_what_is_allowed(words: str, capsys:
     assert main.main(words.split()) == 2
     *progress, line = capsys.readouterr().err.splitlines()
     assert line.startswith("error: ") and WRONG[words] in line, line
-    assert all(text.endswith(" s  looking at the logs") for text in progress)
+    assert all(text.endswith(" s  checking the logs") for text in progress), progress
     assert not Path("diagnosis").exists() and not Path("x").exists()
 
 
