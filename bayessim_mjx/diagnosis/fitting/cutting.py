@@ -96,6 +96,7 @@ def windows_of(
             group=group,
             use_qvel=use_qvel,
             centred=centred,
+            enough=CUTTING.fewest,
         )
 
     if len(cuts(1)) < CUTTING.least:

@@ -108,12 +108,14 @@ def cut(
     use_qvel: bool = True,
     starts: list[tuple[int, int]] | None = None,
     centred: bool = True,
+    enough: int | None = None,
 ) -> Windows:
     """Windows of `length` control steps, at most `limit`, spread evenly over the logs.
 
     Args:
         use_qvel: compare measured velocities too (where all logs have them).
         starts: (log, row) of the windows wanted; beyond the end of a log its last row is held.
+        enough: windows; where as many have a recorded past, the others are left out (`_starts`).
         centred: commands are centred on the force evaluations, where the integrator is `staggered`; False: the physics
             does that (`centred.physics_of`).
 
@@ -123,7 +125,7 @@ def cut(
     even, centred = [resample(log, dt) for log in logs], centred and staggered(model)
     fine = [_fine_commands(log, e, dt, substeps, centred) for log, e in zip(logs, even, strict=True)]
     group_of, names = groups_of(logs, group)
-    starts = _starts(even, length, limit, _past(dt)) if starts is None else starts
+    starts = _starts(even, length, limit, _past(dt), enough) if starts is None else starts
     if not starts:
         longest = max(len(e) - 1 for e in even)
         raise UserError(
@@ -180,17 +182,20 @@ def _past(dt: float) -> int:
     return max(2, int(np.ceil(AROUND / dt)))
 
 
-def _starts(logs: Sequence[Log], length: int, limit: int, past: int) -> list[tuple[int, int]]:
+def _starts(
+    logs: Sequence[Log], length: int, limit: int, past: int, enough: int | None = None
+) -> list[tuple[int, int]]:
     """(log, row) of windows one after the other, spread evenly where they are too many.
 
-    The first has up to `past` rows before it, as far as that costs no window: which commands acted before a log began
-    is not known, and what remembers them would be judged by a guess.
+    The first of a log has `past` rows before it if `enough` remain, else as many as cost no window: which commands
+    acted before a log began is not known, and what remembers them would be judged by a guess.
     """
-    every = []
-    for r, log in enumerate(logs):
-        last = len(log) - 1 - length
-        if last >= 0:
-            every += [(r, a) for a in range(min(past, last % length), last + 1, length)]
+    last = [len(log) - 1 - length for log in logs]
+    every = [(r, a) for r, end in enumerate(last) for a in range(past, end + 1, length)]
+    if enough is None or len(every) < enough:
+        every = [
+            (r, a) for r, end in enumerate(last) if end >= 0 for a in range(min(past, end % length), end + 1, length)
+        ]
     if len(every) <= limit:
         return every
     keep = np.unique(np.linspace(0, len(every) - 1, limit).round().astype(int))
