@@ -191,7 +191,7 @@ def _starts(
     acted before a log began is not known, and what remembers them would be judged by a guess.
     """
     last = [len(log) - 1 - length for log in logs]
-    every = [(r, a) for r, end in enumerate(last) for a in range(past, end + 1, length)]
+    every = [(r, a) for r, end in enumerate(last) if end >= 0 for a in range(min(past, end), end + 1, length)]
     if enough is None or len(every) < enough:
         every = [
             (r, a) for r, end in enumerate(last) if end >= 0 for a in range(min(past, end % length), end + 1, length)
