@@ -190,12 +190,10 @@ def _starts(
     The first of a log has `past` rows before it if `enough` remain, else as many as cost no window: which commands
     acted before a log began is not known, and what remembers them would be judged by a guess.
     """
-    last = [len(log) - 1 - length for log in logs]
-    every = [(r, a) for r, end in enumerate(last) if end >= 0 for a in range(min(past, end), end + 1, length)]
+    ends = [(r, len(log) - 1 - length) for r, log in enumerate(logs) if len(log) > length]
+    every = [(r, a) for r, end in ends for a in range(min(past, end), end + 1, length)]
     if enough is None or len(every) < enough:
-        every = [
-            (r, a) for r, end in enumerate(last) if end >= 0 for a in range(min(past, end % length), end + 1, length)
-        ]
+        every = [(r, a) for r, end in ends for a in range(min(past, end % length), end + 1, length)]
     if len(every) <= limit:
         return every
     keep = np.unique(np.linspace(0, len(every) - 1, limit).round().astype(int))

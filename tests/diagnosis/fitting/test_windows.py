@@ -150,6 +150,17 @@ def test_the_past_of_a_first_window_is_the_first_row_held():
     np.testing.assert_allclose(around.qpos[inner], LOGS[found.log[inner]].qpos[a - back : a + back + 1], rtol=1e-6)
 
 
+def test_windows_have_a_past_where_enough_remain_and_every_log_keeps_one():
+    """Five rows of past: logs of 101 rows give three windows of 25 behind it, or four with their first rows."""
+    logs = [LOGS[0], LOGS[1], LOGS[2].cut(0, LENGTH + 2)]
+    assert [len(log) for log in logs] == [101, 101, LENGTH + 2]
+    whole, most = cut(logs), cut(logs, enough=7)
+    assert [int((whole.log == r).sum()) for r in range(3)] == [4, 4, 1] and whole.start.min() == 0
+    assert [int((most.log == r).sum()) for r in range(3)] == [3, 3, 1]
+    assert list(most.start[most.log == 0]) == [5, 30, 55] and list(most.start[most.log == 2]) == [1]
+    np.testing.assert_array_equal(cut(logs, enough=8).start, whole.start)
+
+
 def test_unmeasured_velocities_are_not_compared_but_start_the_window():
     found = cut(LOGS)
     assert found.sigma_q == pytest.approx([4e-4], rel=1e-6) and np.isinf(found.sigma_v).all()
