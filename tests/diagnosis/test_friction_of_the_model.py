@@ -45,5 +45,8 @@ def test_too_much_of_it_is_recalibrated(tmp_path):
 def test_too_little_of_it_is_a_missing_effect(tmp_path):
     found = diagnosed(tmp_path, 0.04, 0.08)
     (effect,) = found.effects
-    both = 0.04 * found.parameters["hinge_friction_mult"]["mean"] + effect.parameters["level"].mean
-    assert effect.name == "coulomb_friction" and both == pytest.approx(0.08, rel=0.05)
+    level = effect.parameters["level"]
+    both = 0.04 * found.parameters["hinge_friction_mult"]["mean"] + level.mean
+    # as soft as MuJoCo's, the effect does what the parameter does: their sum is known, neither alone
+    assert effect.name == "coulomb_friction" and level.sd > 0.01 and both == pytest.approx(0.08, abs=level.sd)
+    assert found.gap.with_effects < 1.1

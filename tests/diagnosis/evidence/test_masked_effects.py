@@ -27,6 +27,6 @@ def test_what_a_named_law_can_do_by_itself_is_told_as_hidden_beside_it(tmp_path)
     sprung = scored(fitter, fitter.refresh(fitter.derive(fit, spring.coordinates, np.array(start))), (spring,))
     assert laws.by_effects(pool, sprung) == (own["actuator_bias"].label,)
     dry = own["coulomb_friction"]
-    rubbing = fitter.derive(fit, dry.coordinates, np.array([0.03]))
+    rubbing = fitter.derive(fit, dry.coordinates, np.array([0.03, 0.0]))
     assert laws.by_effects(pool, scored(fitter, fitter.refresh(rubbing), (dry,))) == ()
     assert laws.by_effects(pool, base) == ()

@@ -26,7 +26,7 @@ def rubbing(tmp_path_factory):
     setup = prepare(nominal(tmp_path_factory.mktemp("dry")), recorded(friction=FRICTION), Request(["coulomb_friction"]))
     fitter, fit = fitted(setup)
     (candidate,) = setup.candidates
-    new = fitter.derive(fit, candidate.coordinates, np.array([0.01]))
+    new = fitter.derive(fit, candidate.coordinates, np.array([0.01, 0.0]))  # level, relaxation
     (new,) = fitter.iterate([new], 12, lambda f: range(len(f.coordinates)))
     return fitter, fit, fitter.refresh(new), candidate
 
@@ -70,13 +70,14 @@ def test_columns_are_derivatives_of_the_residual(clean):
 
 def test_a_level_of_dry_friction_is_recovered(rubbing):
     fitter, base, fit, candidate = rubbing
-    assert fit.values[-1] == pytest.approx(FRICTION, rel=0.05)
+    level = fit.values[-2]
+    assert level == pytest.approx(FRICTION, rel=0.05)
     assert fit.values[:3] == pytest.approx([1, 1, 1], rel=0.1)
     assert fit.cost < 0.5 * base.cost
     model = scored(fitter, fit, (candidate,))
     assert model.total < 0.5 * scored(fitter, base, ()).total
-    assert abs(fit.values[-1] - FRICTION) < 4 * of_noise(fitter, model)[-1, -1] ** 0.5 + 0.02 * FRICTION
-    assert model.values_of(candidate) == pytest.approx([fit.values[-1]])
+    assert abs(level - FRICTION) < 4 * of_noise(fitter, model)[-2, -2] ** 0.5 + 0.02 * FRICTION
+    assert model.values_of(candidate) == pytest.approx(fit.values[-2:])
 
 
 def test_windows_far_worse_than_the_rest_count_less(rubbing):
@@ -90,12 +91,12 @@ def test_windows_far_worse_than_the_rest_count_less(rubbing):
 def test_columns_of_steps_that_are_refused_are_not_simulated_on_a_cpu(rubbing, monkeypatch):
     """An accelerator simulates them in one call with the trial; the fits are the same."""
     fitter, base, _, candidate = rubbing
-    start = fitter.derive(base, candidate.coordinates, np.array([0.4]))
+    start = fitter.derive(base, candidate.coordinates, np.array([0.4, 0.0]))
     fits, spent = [], []
     for apart in (False, True):
         monkeypatch.setattr(fitter.simulator, "apart", apart)
         before = fitter.simulator.rollouts
-        fits += fitter.iterate([start], 12, lambda f: [len(f.coordinates) - 1])
+        fits += fitter.iterate([start], 12, lambda f: [len(f.coordinates) - 2])
         spent.append(fitter.simulator.rollouts - before)
     together, one_by_one = fits
     assert one_by_one.history == together.history and len(set(together.history)) < len(together.history)  # some refused
@@ -120,7 +121,7 @@ def test_numbers_that_do_the_same_have_the_same_column(tmp_path):
     for level in (0.02, 0.03, 0.04, 0.05):  # friction is rough: near another point a column differs by as much again
         at = fit
         for candidate, value in zip(setup.candidates, (level, 0.01), strict=True):
-            at = fitter.derive(at, candidate.coordinates, np.full(len(candidate.coordinates), value))
+            at = fitter.derive(at, candidate.coordinates, np.array([value, 0.0])[: len(candidate.coordinates)])
         first = fitter.refresh(at)  # at steps by their ranges
         sizes.append((apart(first), apart(fitter.refresh(first))))
     by_range, by_change = np.median(sizes, axis=0)
