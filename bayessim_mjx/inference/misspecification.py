@@ -81,8 +81,9 @@ class Misfit:
         return f"the real trajectories are unlike anything simulated ({count}): {self._why(worst)}"
 
     def _why(self, row: int) -> str:
-        score = int(np.argmin(self.parts[row]))
-        if TWO_SIDED[score] and self.sides[row, score] < 0:
+        # of all trajectories together: the least likely one may lie on the other side by chance
+        score = int(np.argmin([combined(own) for own in self.parts.T]))
+        if TWO_SIDED[score] and np.median(self.sides[:, score]) < 0:
             return "they follow the simulator too closely, so the noise is assumed too large"
         return f"something moves them that no parameter explains, or the noise is larger (most in {self.worst(row)})"
 
