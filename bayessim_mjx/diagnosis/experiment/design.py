@@ -157,6 +157,8 @@ class Scorer:
         coordinates, base = self.models[i].fit.coordinates, len(self.fitter.base)
         relative = np.sqrt(variance) / np.array([c.high - c.low for c in coordinates])
         first = base if len(coordinates) > base else 0
+        # optional numbers are mostly off: how large an effect is matters more
+        relative[base:][[self.setup.physics.quantity(c.index[0]).optional for c in coordinates[base:]]] = 0.0
         worst = first + int(np.argmax(relative[first:]))
         return worst, float(variance[worst])
 
