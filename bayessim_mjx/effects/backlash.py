@@ -47,11 +47,9 @@ class Backlash(transmission.OfTransmission, Effect):
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
         on, gap, fresh = self.on(at, theta), at.values(theta)[:, 0], memory["fresh"]
         both = transmission.sides(at, memory, step, on, self.mark)
-        none, whole = jnp.zeros(len(at)), jnp.full(len(at), step.dt)
-        soft = at.values(theta)[:, 1] if TEETH in self.quantities else None
-        teeth = none, none, whole
-        if soft is not None:
-            teeth = transmission.sprung(both, step.dt, jnp.where(fresh, 0.0, soft), RATIO)
+        none = jnp.zeros(len(at))
+        soft = at.values(theta)[:, 1] if TEETH in self.quantities else none
+        teeth = transmission.sprung(both, step.dt, jnp.where(fresh, 0.0, soft), RATIO)
 
         def solve(side: jax.Array) -> transmission.Passed:
             rest = jnp.where(fresh, 0.0, gap * side)
@@ -60,8 +58,5 @@ class Backlash(transmission.OfTransmission, Effect):
         twist = both.twist + step.dt * solve(none).slip  # if nothing touched
         side = jnp.where(jnp.abs(twist) > gap, jnp.sign(twist), 0.0)
         passed = solve(jnp.where(solve(side).torque * side > 0, side, 0.0))
-        wound = gap * jnp.sign(passed.torque)
-        if soft is not None:
-            wound = wound + soft * passed.torque
-        twist = jnp.where(fresh, wound, both.twist)
+        twist = jnp.where(fresh, gap * jnp.sign(passed.torque) + soft * passed.torque, both.twist)
         return transmission.finish(at, memory, step, both, passed, twist, self.encoder(at, theta))

@@ -15,7 +15,7 @@ from flax import struct
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from bayessim_mjx.compat import compiler_options
+from bayessim_mjx.compat import brief
 from bayessim_mjx.diagnosis.experiment.limits import Excitation, Limits, drives_of, middle
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 from bayessim_mjx.diagnosis.setup import Setup
@@ -73,7 +73,7 @@ class Rehearsal:
         self.can_switch = windows.batch.enabled is not None
         self.rest = np.median(np.concatenate([log.ctrl for log in windows.logs]), axis=0)
         self.lanes = 0
-        self._run = jax.jit(jax.vmap(self._one), compiler_options=compiler_options(level=None))
+        self._run = brief(jax.vmap(self._one), level=None)
 
     @property
     def count(self) -> int:

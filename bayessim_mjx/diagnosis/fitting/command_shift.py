@@ -107,12 +107,8 @@ def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -
     r = model.residual(x, starts)
     A, linear = model.columns(x, starts, r), x  # where the derivatives are those of
     B = errors.columns(sigma)
-    least, gained, change = (
-        1e-6,
-        np.inf,
-        np.full(model.size, np.inf),
-    )  # damping, of a curvature; by Levenberg, Marquardt
-    damping = least
+    gained, change = np.inf, np.full(model.size, np.inf)
+    damping = least = 1e-6  # share of the curvature, by Levenberg and Marquardt
     while (gained > len(cut) or damping > least) and abs(x[0]) < 1 and np.abs(change).max() > STEP:
         q, found = eliminate(r, A, B, errors.offsets + starts, cut.spread)
         g, S = q.weighted(np.ones(len(cut)))

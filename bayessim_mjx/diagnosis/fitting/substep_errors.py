@@ -110,7 +110,7 @@ class Errors:
         world = world.replace(qpos=integrate(physics.mj_model, world.qpos, offset[:nv]), qvel=world.qvel + offset[nv:])
         model = physics.model_of(world).tree_replace({"opt.timestep": h})
         early = 0.5 * corrected * h if staggered(physics.mj_model) else 0.0
-        thetas = physics.split(world.theta)[1]  # of the model's own forces, which have no parameters
+        thetas = physics.split(world.theta)[1]  # of its own forces and its servos' gains
 
         def step(carry: tuple, row: tuple) -> tuple[tuple, tuple]:
             (data, memory), (command, enabled, extra) = carry, row
