@@ -1,4 +1,4 @@
-"""Effects that no world of a call has are left out by branches: the same motion, bit for bit."""
+"""Effects that no world of a call has are left out by branches: the same motion."""
 
 import jax
 import jax.numpy as jnp
@@ -69,12 +69,13 @@ def test_what_acts_is_what_is_not_neutral(physics):
 @pytest.mark.parametrize("names", [(), *[(name,) for name in ON], ("actuator_delay", "coulomb_friction")])
 @pytest.mark.slow
 @pytest.mark.ci
-def test_the_motion_is_the_same_bit_for_bit(physics, both, names):
+def test_the_motion_is_the_same(physics, both, names):
+    """Both are programs of their own, and a compiler may fuse a product and a sum in one of them: to rounding."""
     thetas = np.stack([physics.neutral, middle(physics, *names), 0.5 * (physics.neutral + middle(physics, *names))])
     plain, some = both
     expected, got = plain(thetas), some(thetas, physics.acting(thetas).any(0))
     for a, b in zip(expected, got, strict=True):
-        np.testing.assert_array_equal(a, b)
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)  # 8 roundings of a number near 1
     assert (not names) == np.array_equal(expected[1][0], expected[1][1])  # these effects do act
 
 
