@@ -181,6 +181,15 @@ class Effect(abc.ABC):
         """
         return memory, after
 
+    def on_motors(
+        self, at: Site, memory: Any, state: "Measurement", ahead: "Measurement", theta: jax.Array
+    ) -> "tuple[Any, Measurement]":
+        """Change at a start how far and how fast motors are ahead of their links: more, by `ahead`, `[nv]` each.
+
+        What the encoders show stays: where they sit on the motors, the links move. A diagnosis finds `ahead`.
+        """
+        return memory, state
+
     def on_command(self, at: Site, memory: Any, command: jax.Array, theta: jax.Array) -> tuple[Any, jax.Array]:
         """Change the command of one control step, `[substeps, nu]`: one row per sub-step (four of them by RK4)."""
         return memory, command

@@ -179,6 +179,7 @@ class Past(struct.PyTreeNode):
         physics: static; start: the world that they lead up to.
         world: at the first of them, `start` itself where there are none; motion: the true one.
         steps: how many, static; wanted: `[]` bool, whether an active effect needs them.
+        ahead: `[2 nv]`, by which motors are further ahead of their links than the past says (`Effect.on_motors`).
     """
 
     physics: Physics = struct.field(pytree_node=False)
@@ -187,6 +188,7 @@ class Past(struct.PyTreeNode):
     motion: Motion
     steps: int = struct.field(pytree_node=False)
     wanted: jax.Array
+    ahead: jax.Array | None = None
 
     @property
     def first(self) -> int | jax.Array:
@@ -220,7 +222,20 @@ class Past(struct.PyTreeNode):
         each = zip(self.physics.effects, own.memory, self.start.memory, strict=True)
         memory = (jax.tree.map(kept, new, old) if effect.follows else old for effect, new, old in each)
         qpos, qvel = kept(own.qpos, self.start.qpos), kept(own.qvel, self.start.qvel)
-        return self.start.replace(memory=tuple(memory), qpos=qpos, qvel=qvel)
+        return self._ahead(self.start.replace(memory=tuple(memory), qpos=qpos, qvel=qvel))
+
+    def _ahead(self, world: World) -> World:
+        """Return the start with motors further ahead of their links."""
+        if self.ahead is None:
+            return world
+        ahead = dict(zip(("qpos", "qvel"), jnp.split(self.ahead, 2), strict=True))
+        state, memory = {"qpos": world.qpos, "qvel": world.qvel}, list(world.memory)
+        thetas = self.physics.split(world.theta)[1]
+        for i in self.physics.having("on_motors"):
+            memory[i], state = self.physics.effects[i].on_motors(
+                self.physics.sites[i], memory[i], state, ahead, thetas[i]
+            )
+        return world.replace(memory=tuple(memory), **state)
 
     def _recorded(self, before: World, after: World) -> World:
         """`after`, a recorded state with the memories of `before`, as what follows the motion takes it."""

@@ -109,9 +109,9 @@ def refit(found: Reopened) -> Said:
     return told(found, found.pool.base)
 
 
-def bic(model: Model, spread: np.ndarray) -> float:
+def bic(model: Model) -> float:
     """N log(RSS / N) + k log N (Schwarz, 1978) in sample, every residual counted as independent."""
-    q, _ = model.fit.quadratic(spread)
+    q, _ = model.fit.quadratic()
     n = model.fit.r.size
     return float(n * np.log(q.c.sum() / n) + model.size * np.log(n))
 
@@ -119,12 +119,12 @@ def bic(model: Model, spread: np.ndarray) -> float:
 def naive_bic(found: Reopened) -> Said:
     """The lowest BIC of all models that were fitted, the known parameters alone among them."""
     pool = found.pool
-    return told(found, min(pool.models.values(), key=lambda m: bic(m, pool.fitter.spread)))
+    return told(found, min(pool.models.values(), key=bic))
 
 
-def fold_error(pool: SearchState, model: Model, test: np.ndarray) -> float:
+def fold_error(model: Model, test: np.ndarray) -> float:
     """Cost of the windows `test` `[W]` (bool) under the estimates from the others, by one Newton step from the fit."""
-    q, _ = model.fit.quadratic(pool.fitter.spread)
+    q, _ = model.fit.quadratic()
     precision, pull, low, high = model.fit.prior()
     g, S = q.weighted(model.fit.weight * ~test)
     p = solve(S + np.diag(precision + RULES.trust * np.diag(S)), g + pull, low, high)
@@ -138,7 +138,7 @@ def single_fold(found: Reopened) -> Said:
     rng = np.random.default_rng(found.setup.seed)
     tested = rng.choice(names, max(1, round(TESTED * len(names))), replace=False)
     test = np.isin(group, tested)
-    return told(found, min(pool.models.values(), key=lambda m: fold_error(pool, m, test)))
+    return told(found, min(pool.models.values(), key=lambda m: fold_error(m, test)))
 
 
 def importance(found: Reopened) -> Said:

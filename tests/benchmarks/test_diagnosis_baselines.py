@@ -36,7 +36,7 @@ def model(r: np.ndarray, own: list[int]) -> Model:
     k = len(own)
     left = (r.ravel() - design @ x).reshape(r.shape)
     coordinates = tuple(coordinate(f"p{i}", i) for i in own)
-    fit = Fit(coordinates, x[:k], x[k:, None], left, A, STARTS, np.ones(WINDOWS), float(np.sum(left**2)))
+    fit = Fit(coordinates, x[:k], x[k:, None], left, A, STARTS, np.ones(WINDOWS), float(np.sum(left**2)), spread=SPREAD)
     return Model((), fit, np.ones(WINDOWS), np.ones(WINDOWS), np.zeros((2, k)), 1.0)
 
 
@@ -46,15 +46,14 @@ def test_bic_is_schwarz_on_the_least_squares_residual():
     n = r.size
     for m in (small, right):
         expected = n * np.log(np.sum(m.fit.r**2) / n) + m.size * np.log(n)
-        assert baselines.bic(m, SPREAD) == pytest.approx(expected, rel=1e-6)
-    assert baselines.bic(right, SPREAD) < baselines.bic(small, SPREAD)
+        assert baselines.bic(m) == pytest.approx(expected, rel=1e-6)
+    assert baselines.bic(right) < baselines.bic(small)
 
 
 def test_fold_error_is_that_of_least_squares_without_the_test_windows():
     r = COLUMNS[:, :, 1] + 0.1 * RNG.normal(size=(WINDOWS, SAMPLES))
     test = np.arange(WINDOWS) >= 8
-    fitter = SimpleNamespace(spread=SPREAD)
-    got = baselines.fold_error(SimpleNamespace(fitter=fitter), model(r, [0, 1]), test)
+    got = baselines.fold_error(model(r, [0, 1]), test)
     # outside of the start states, fitted on the first eight windows
     free = np.linalg.qr(STARTS)[0]
     out = lambda x: x - free @ (np.swapaxes(free, 1, 2) @ x)  # noqa: E731
@@ -85,7 +84,7 @@ def toy(size: float) -> tuple[SimpleNamespace, Fit, list[Candidate]]:
     )
     base = Coordinate("base", (0,), 0.0, -1.0, 1.0)
     blank = np.zeros((WINDOWS, 1))
-    fit = Fit((base,), np.zeros(1), blank, RECORDED, COLUMNS[:, :, :1], STARTS, np.ones(WINDOWS), 0.0)
+    fit = Fit((base,), np.zeros(1), blank, RECORDED, COLUMNS[:, :, :1], STARTS, np.ones(WINDOWS), 0.0, spread=SPREAD)
     one = [Coordinate(n, (i,), 0.0, -20.0, 20.0) for i, n in ((1, "first"), (2, "second"))]
     return fitter, fit, [Candidate(c.name, "here", "joint", (c,), (False,)) for c in one]
 

@@ -58,7 +58,7 @@ def test_dry_friction_is_named_with_its_level(rubbing):
     assert effect.gap_closed > 0.8
     before, after = (found.predictions[k].cost(10**6).sum() for k in ("calibrated", "with_effects"))
     learnt = found.selection.estimated.noise
-    noise = heldout.noise_floor(found.setup.fitter, found.model.fit, learnt).sum()
+    noise = heldout.noise_floor(found.model.fit, learnt).sum()
     assert effect.gap_closed == pytest.approx(min((before - after) / (before - noise), 1.0))
     low, high = effect.gap_closed_ci
     assert 0.8 < low < effect.gap_closed <= high <= 1.0

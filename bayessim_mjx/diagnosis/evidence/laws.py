@@ -216,7 +216,7 @@ def by_effects(state: SearchState, answer: Model, say: Progress = lambda text, d
         own,
         lambda _, done, all_: say("masked effects", done, all_),
     )
-    found = judged(state.fitter, answer.fit, columns, own)
+    found = judged(answer.fit, columns, own)
     return tuple(label for label, each in found.items() if min(s.absorbed for s, _ in each) > HIDDEN)
 
 
@@ -224,7 +224,7 @@ def _shown(
     state: SearchState, model: Model, candidates: Sequence[Candidate]
 ) -> dict[str, list[tuple[Screened, Array]]]:
     """{label: what is hidden of it at each starting point}, what shows most first, without a simulation."""
-    found = judged(state.fitter, model.fit, state.secants.of(candidates), state.secants.own)
+    found = judged(model.fit, state.secants.of(candidates), state.secants.own)
     return {label: sorted(several, key=lambda pair: pair[0].absorbed) for label, several in found.items()}
 
 
@@ -268,7 +268,7 @@ def stand_ins(state: SearchState, answer: Model) -> list[StandIn]:
     if not columns:
         return []
     fit = part(answer.fit, state.secants.own)
-    project = Projection(state.fitter, fit)
+    project = Projection(fit)
     works = [(c, steps) for c in columns if (steps := project.taken(c.change, HIDDEN)) is not None]
     least = max(-state.log_prior(frozenset("x")) - np.log(ODDS.strong), np.log(ODDS.mention))
     away, out = fit.values - np.array([c.neutral for c in fit.coordinates]), list[StandIn]()

@@ -251,6 +251,6 @@ def _linear(state: SearchState, effects: Sequence[Candidate]) -> tuple[Quadratic
     moved = fitter.whiten(fitter.simulator.run(np.stack(thetas), np.repeat(fit.offsets[None], len(thetas), 0)))
     columns = [Column(*pair, fit.r - own) for pair, own in zip(pairs, moved, strict=True)]
     A = np.concatenate([fit.A, *(c.change[..., None] for c in columns)], axis=2)
-    q, _ = eliminate(fit.r, A, fit.B, fit.offsets, fitter.spread)
+    q, _ = eliminate(fit.r, A, fit.B, fit.offsets, fit.spread)
     precision, most = [c.precision for c in columns], [c.room[1] for c in columns]
     return q, np.array([*fit.belief(), *precision]), np.array(most)

@@ -169,8 +169,7 @@ class Weighing:
 
     def windows(self, fit: Fit, own: NDArray[np.int64] | slice = slice(None)) -> Windows:
         """Return the linear model about a fit to the windows `own`."""
-        spread = self.state.fitter.spread
-        return windows_of(fit.r, fit.A, fit.B, self.D[own], fit.offsets, spread, self.scale, self.channels)
+        return windows_of(fit.r, fit.A, fit.B, self.D[own], fit.offsets, fit.spread, self.scale, self.channels)
 
     def products(self, fit: Fit, hyper: Hyper, more: Array, own: NDArray[np.int64]) -> tuple[Array, float]:
         """`Marginal.Q` of (r, A, more `[w, n, c]`), and the log determinant, summed over the windows `own`."""

@@ -54,7 +54,7 @@ class Scorer:
         self.points = [self._points(i) for i in range(len(models))]
 
     def _posterior(self, model: Model, discount: float) -> Array:
-        q, _ = model.fit.quadratic(self.fitter.spread)
+        q, _ = model.fit.quadratic()
         _, S = q.weighted(model.fit.weight)
         return discount * S + np.diag(model.fit.belief())
 
@@ -110,7 +110,7 @@ class Scorer:
         for fits, some in where:
             r, x = (fits[j].r - fits[i].r)[some], np.zeros_like(fits[j].offsets[some])
             A = np.concatenate([fits[j].A[some], -fits[i].A[some]], axis=2)
-            q, _ = eliminate(r, A, fits[j].B[some], x, self.fitter.spread)
+            q, _ = eliminate(r, A, fits[j].B[some], x, fits[j].spread)
             c, g, S = c + q.c.sum(), g + q.g.sum(0), S + q.S.sum(0)
         return float(c), g, S
 

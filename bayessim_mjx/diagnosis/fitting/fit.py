@@ -28,6 +28,7 @@ class Fit:
         promise: by how much the next step would lower the cost if the model were linear; history: costs, step by step.
         doubt: squared misfit per independent number in the data, by which priors of stated parameters are multiplied.
         reach: `[W]`, share of their own steps that the start states make: less after one that did a window harm.
+        spread: `[s]`, standard deviations of the start states' prior; those of motors are learnt (`learnt_spread`).
         inferred: {kind: factor of its priors' precision} where the data sheet's accuracy was inferred (`accuracy`).
     """
 
@@ -44,6 +45,7 @@ class Fit:
     history: tuple[float, ...] = ()
     doubt: float = 1.0
     reach: Array = field(default_factory=lambda: np.ones(1))
+    spread: Array = field(default_factory=lambda: np.ones(1))
     inferred: Mapping[str, float] | None = None
 
     @property
@@ -112,8 +114,8 @@ class Fit:
             out += min(far, n) + tail if self.inferred is None else self.inferred[kind] * far
         return out
 
-    def quadratic(self, spread: Array) -> tuple[Quadratic, Starts]:
-        return eliminate(self.r, self.A, self.B, self.offsets, spread)
+    def quadratic(self) -> tuple[Quadratic, Starts]:
+        return eliminate(self.r, self.A, self.B, self.offsets, self.spread)
 
 
 def broyden(A: Array, fit: Fit, values: Array, x: Array, r: Array, which: Sequence[int]) -> None:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting import quadratic
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
-from bayessim_mjx.diagnosis.fitting.fit import Fit, broyden, settled
+from bayessim_mjx.diagnosis.fitting.fit import REACH, Fit, broyden, settled
 from bayessim_mjx.diagnosis.fitting.quadratic import blocks, held_out, solve, weights
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
+from bayessim_mjx.diagnosis.fitting.windows import Windows
 
 __all__ = ["Fit", "Fitter", "weights"]
 Array = NDArray[np.float64]
@@ -66,7 +67,8 @@ class Fitter:
         sigma = np.concatenate([windows.sigma_q, windows.sigma_v])
         self.used = np.isfinite(sigma)
         self.sigma = sigma[self.used]
-        self.spread = windows.spread
+        motors = simulator.starts > len(windows.spread)
+        self.spread = np.concatenate([windows.spread, _of_motors(windows)]) if motors else windows.spread
         self.measured = windows.measured / windows.measured.mean()  # by which windows weigh, one on average
         self.size = windows.steps * int(self.used.sum())
         joints = int((np.isfinite(windows.sigma_q) | np.isfinite(windows.sigma_v)).sum())
@@ -96,11 +98,23 @@ class Fitter:
         """Thetas with one number moved by its step each."""
         return [self.vector(fit.coordinates, values + np.where(np.arange(len(values)) == i, steps, 0.0)) for i in which]
 
-    def start_columns(self, theta: Array, offsets: Array, r: Array) -> Array:
-        """B `[W, n, s]` at theta."""
-        h = quadratic.RULES.change * self.spread
-        moved = offsets[None] + np.diag(h)[:, None, :]
-        return quadratic.columns(r, self.whiten(self.simulator.run(np.repeat(theta[None], len(h), 0), moved)), h)
+    def start_columns(
+        self,
+        theta: Array,
+        offsets: Array,
+        r: Array,
+        spread: Array | None = None,
+        which: NDArray[np.bool_] | None = None,
+    ) -> Array:
+        """B `[W, n, s]` at theta; which: `[s]`, columns that are simulated, None: all that act; the others are 0."""
+        spread = self.spread if spread is None else spread
+        h = quadratic.RULES.change * np.clip(spread, self.spread / REACH, self.spread * REACH)
+        own = np.flatnonzero(self.simulator.loose(theta) if which is None else which)
+        moved = offsets[None] + np.diag(h)[own, None, :]
+        B = np.zeros((*r.shape, len(h)))
+        shifted = self.whiten(self.simulator.run(np.repeat(theta[None], len(own), 0), moved))
+        B[:, :, own] = quadratic.columns(r, shifted, h[own])
+        return B
 
     def begin(
         self, coordinates: Sequence[Coordinate], values: Array | None = None, offsets: Array | None = None
@@ -109,27 +123,31 @@ class Fitter:
         coordinates = tuple(coordinates)
         values = np.array([c.neutral for c in coordinates]) if values is None else np.asarray(values, float)
         offsets = np.zeros((len(self.simulator.windows), len(self.spread))) if offsets is None else offsets
-        fit = Fit(coordinates, values, offsets, np.empty(0), np.empty(0), np.empty(0), np.ones(len(offsets)), np.inf)
-        return self.refresh(fit)
+        none, even = np.empty(0), np.ones(len(offsets))
+        return self.refresh(Fit(coordinates, values, offsets, none, none, none, even, np.inf, spread=self.spread))
 
     def refresh(self, fit: Fit) -> Fit:
         """Residuals and all columns anew at the fit's point: central differences where ranges have room."""
         theta, every = self.vector(fit.coordinates, fit.values), range(len(fit.values))
+        loose = self.simulator.loose(theta)
+        fit = replace(fit, offsets=np.where(loose, fit.offsets, 0.0), spread=np.where(loose, fit.spread, self.spread))
         steps = fit.inward(fit.values, fit.steps())
         both = [i for i in every if fit.coordinates[i].low <= fit.values[i] - steps[i] <= fit.coordinates[i].high]
         thetas = [theta, *self._shifts(fit, fit.values, every, steps), *self._shifts(fit, fit.values, both, -steps)]
         r = self.whiten(self.simulator.run(np.stack(thetas), np.repeat(fit.offsets[None], len(thetas), 0)))
         A = quadratic.columns(r[0], r[1 : 1 + len(every)], steps)
         A[:, :, both] = (A[:, :, both] + quadratic.columns(r[0], r[1 + len(every) :], -steps[both])) / 2
-        B = self.start_columns(theta, fit.offsets, r[0])
-        new = replace(fit, r=r[0], A=A, B=B, weight=weights(r[0]) * self.measured)
+        B, weight = self.start_columns(theta, fit.offsets, r[0], fit.spread), weights(r[0]) * self.measured
+        motors = np.flatnonzero(loose)[len(self.simulator.windows.spread) :]
+        spread = quadratic.learnt_spread(r[0], B, fit.offsets, fit.spread, weight, motors)
+        new = replace(fit, r=r[0], A=A, B=B, weight=weight, spread=spread)
         new = replace(new, doubt=self._doubt(self._data(new, new.r, new.offsets)))
         return replace(new, cost=self.cost(new, new.r, new.offsets, new.values))
 
     def anew(self, fit: Fit) -> Fit:
         """All columns anew where the fit is, by one-sided differences: a step that is refused needs no better ones."""
         theta, steps = self.vector(fit.coordinates, fit.values), fit.inward(fit.values, fit.steps())
-        A, B = fit.A, self.start_columns(theta, fit.offsets, fit.r)
+        A, B = fit.A, self.start_columns(theta, fit.offsets, fit.r, fit.spread)
         if len(steps):
             thetas = np.stack(self._shifts(fit, fit.values, range(len(steps)), steps))
             r = self.whiten(self.simulator.run(thetas, np.repeat(fit.offsets[None], len(thetas), 0)))
@@ -146,21 +164,37 @@ class Fitter:
         return data + fit.penalty(values) + self.numbers * self._doubt(data) * float(np.expm1(min(stated, 50.0)))
 
     def _data(self, fit: Fit, r: Array, offsets: Array) -> float:
-        return float(fit.weight @ self._each(r, offsets))
+        return float(fit.weight @ _each(fit, r, offsets))
 
     def _doubt(self, data: float) -> float:
         """Squared misfit per independent number; under a perfect model the noise's own."""
         return max(data, float(self.size * len(self.simulator.windows))) / self.numbers
-
-    def _each(self, r: Array, offsets: Array) -> Array:
-        return np.sum(r**2, 1) + np.sum((offsets / self.spread) ** 2, 1)
 
     def derive(self, fit: Fit, extra: Sequence[Coordinate], values: Array) -> Fit:
         """Return a fit with more coordinates, starting at `values`; its first columns come with the first step."""
         own = tuple(fit.coordinates) + tuple(extra)
         blank = np.zeros((*fit.r.shape, len(extra)))
         start, columns = np.concatenate([fit.values, values]), np.concatenate([fit.A, blank], 2)
-        return Fit(own, start, fit.offsets, fit.r, columns, fit.B, fit.weight, np.inf, doubt=fit.doubt)
+        new = Fit(own, start, fit.offsets, fit.r, columns, fit.B, fit.weight, np.inf)
+        return replace(new, doubt=fit.doubt, spread=fit.spread)
+
+    def without(self, fit: Fit, own: Sequence[int]) -> Fit:
+        """Return a fit with some of the coordinates, where they are; its first step simulates."""
+        coordinates, values = tuple(fit.coordinates[i] for i in own), fit.values[own]
+        loose = self.simulator.loose(self.vector(coordinates, values))
+        new = Fit(coordinates, values, fit.offsets * loose, fit.r, fit.A[:, :, own], fit.B * loose, fit.weight, np.inf)
+        return replace(new, doubt=fit.doubt, spread=np.where(loose, fit.spread, self.spread))
+
+    def _with_motors(self, fit: Fit) -> Fit:
+        """Return a new fit with columns of motors that its first point sets loose."""
+        if np.isfinite(fit.cost):
+            return fit
+        theta, count = self.vector(fit.coordinates, fit.values), len(self.simulator.windows.spread)
+        new = self.simulator.loose(theta) & (np.arange(len(self.spread)) >= count) & ~fit.B.any((0, 1))
+        if not new.any():
+            return fit
+        r = self.whiten(self.simulator.run(theta[None], fit.offsets[None]))[0]
+        return replace(fit, B=fit.B + self.start_columns(theta, fit.offsets, r, fit.spread, new))
 
     def iterate(
         self,
@@ -180,7 +214,8 @@ class Fitter:
             progress: told how many fits still run.
             keep: (steps made, all fits, indices of those that run) -> indices of those worth going on with.
         """
-        now, trial = list(fits), [(f.values, f.offsets) for f in fits]
+        now = [self._with_motors(fit) for fit in fits]
+        trial = [(f.values, f.offsets) for f in now]
         running: Sequence[int] = range(len(now))
         old = {i for i in running if not np.isfinite(now[i].cost)}  # fits with columns of a point before
         for made in range(iterations + 1):
@@ -265,31 +300,42 @@ class Fitter:
             damping, reach = max(fit.damping / 5, 1e-7), np.minimum(2 * fit.reach, 1.0)
         else:
             # near a contact a start state's full step may be far too long, and no damping of the parameters shortens it
-            harmed = self._each(tried.r, tried.offsets) > self._each(fit.r, fit.offsets)
+            harmed = _each(fit, tried.r, tried.offsets) > _each(fit, fit.r, fit.offsets)
             damping, reach = fit.damping * 6, np.where(harmed, 0.25, 1.0) * fit.reach
         return replace(fit, damping=damping, reach=reach, history=(*fit.history, fit.cost))
 
     def _propose(self, fit: Fit) -> tuple[Fit, tuple[Array, Array]]:
         """Return (the fit with its next step's promise, the point to be tried next: values and offsets)."""
-        q, starts = fit.quadratic(self.spread)
+        q, starts = fit.quadratic()
         g, S = q.weighted(fit.weight)
         precision, pull, low, high = fit.prior()
         S = S + np.diag(precision)
         p = solve(S + fit.damping * np.diag(_scale(fit, S)), g + pull, low, high)
         share = fit.reach * (2.0 - fit.reach)  # of what a whole step of the start states gains
-        by_starts = float(fit.weight @ (share * (self._each(fit.r, fit.offsets) - q.c)))
+        by_starts = float(fit.weight @ (share * (_each(fit, fit.r, fit.offsets) - q.c)))
         promise = by_starts + float(2 * (g + pull) @ p - p @ S @ p)
         moved = fit.offsets + np.reshape(fit.reach, (-1, 1)) * starts.step(fit.A, p)
         return replace(fit, promise=promise), (fit.values + p, moved)
 
     def scores(self, fit: Fit, group: NDArray[np.int64] | None = None) -> tuple[Array, Array]:
         """Held-out costs `[W]` (unweighted) and estimates without each condition, relative to the fit `[G, k]`."""
-        q, starts = fit.quadratic(self.spread)
+        q, starts = fit.quadratic()
         precision, pull, low, high = fit.prior()
         group = self.simulator.windows.group if group is None else group
         watched = np.arange(len(self.base), len(fit.coordinates))
         split = functools.partial(blocks, q, starts, fit.r, fit.A)
         return held_out(q, group, fit.weight, precision, pull, low, high, watched, split)
+
+
+def _of_motors(windows: Windows) -> Array:
+    """`[2 nv]`, first standard deviations of motors beside their links: a joint's speed, and a control step of it."""
+    speed = np.sqrt(np.mean(np.asarray(windows.batch.qvel, np.float64) ** 2, axis=(0, 1)))
+    return np.maximum(np.concatenate([windows.dt * speed, speed]), windows.spread)
+
+
+def _each(fit: Fit, r: Array, offsets: Array) -> Array:
+    """`[W]`, what windows with these residuals and start states cost."""
+    return np.asarray(np.sum(r**2, 1) + np.sum((offsets / fit.spread) ** 2, 1))
 
 
 def _scale(fit: Fit, S: Array) -> Array:

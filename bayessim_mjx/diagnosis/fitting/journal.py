@@ -22,7 +22,7 @@ from bayessim_mjx import atomic
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 
-ARRAYS = ("values", "offsets", "r", "A", "B", "weight", "reach")
+ARRAYS = ("values", "offsets", "r", "A", "B", "weight", "reach", "spread")
 NUMBERS = ("cost", "damping", "promise", "doubt")
 ABOUT = "about.txt"
 FILES = "[0-9][0-9][0-9][0-9][0-9].npz"

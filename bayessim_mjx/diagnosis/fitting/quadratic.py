@@ -89,7 +89,22 @@ def _dot(a: Array, b: Array) -> Array:
 
 def eliminate(r: Array, A: Array, B: Array, x: Array, spread: Array) -> tuple[Quadratic, Starts]:
     """(quadratic in the parameters, starts) for r `[W, n]`, A `[W, n, K]`, B `[W, n, s]`, x `[W, s]`, spread `[s]`."""
-    M = np.asarray(np.linalg.inv(B.mT @ B + np.diag(1 / spread**2)), np.float64)
+    own = moving(B)
+    if len(own) == B.shape[2]:
+        return _eliminated(r, A, B, x, spread)
+    q, some = _eliminated(r, A, B[:, :, own], x[:, own], np.broadcast_to(spread, x.shape[1:])[own])
+    M, b = np.tile(np.diag(spread**2), (len(r), 1, 1)), -x / spread**2
+    M[:, own[:, None], own], b[:, own] = some.M, some.b
+    return q, Starts(B, M, b)
+
+
+def moving(B: Array) -> NDArray[np.intp]:
+    """Return which start states move anything in any window."""
+    return np.flatnonzero(B.any((0, 1)))
+
+
+def _eliminated(r: Array, A: Array, B: Array, x: Array, spread: Array) -> tuple[Quadratic, Starts]:
+    M = inverted(B, spread)
     b = times(B.mT, r) - x / spread**2
     BA = B.mT @ A  # products of matrices throughout: einsum takes several times as long
     MBA = M @ BA
@@ -97,6 +112,26 @@ def eliminate(r: Array, A: Array, B: Array, x: Array, spread: Array) -> tuple[Qu
     g = times(A.mT, r) - times(MBA.mT, b)
     S = A.mT @ A - BA.mT @ MBA
     return Quadratic(c, g, S), Starts(B, M, b)
+
+
+def inverted(B: Array, spread: Array) -> Array:
+    """`[W, s, s]`, posterior covariances of start states with columns B `[W, n, s]` and prior `spread` `[s]`."""
+    return np.asarray(np.linalg.inv(B.mT @ B + np.diag(1 / spread**2)), np.float64)
+
+
+def learnt_spread(r: Array, B: Array, x: Array, spread: Array, weight: Array, own: NDArray[np.intp]) -> Array:
+    """Return the prior's standard deviations `[s]`, those of the numbers `own` as the windows make them likely.
+
+    By expectation maximisation (Dempster, Laird and Rubin, J. R. Stat. Soc. B 39, 1977): the mean square of the start
+    states' posterior, as often as windows have parts. As in `eliminate`; weight: `[W]`.
+    """
+    out, share = spread.copy(), weight / weight.sum()
+    for _ in range(RULES.parts if len(own) else 0):
+        M = inverted(B, out)
+        mean = x + times(M, times(B.mT, r) - x / out**2)
+        square = share @ (mean**2 + np.diagonal(M, axis1=1, axis2=2))
+        out[own] = np.sqrt(square[own])
+    return out
 
 
 def blocks(q: Quadratic, starts: Starts, r: Array, A: Array, w: int, count: int = RULES.parts) -> Quadratic:

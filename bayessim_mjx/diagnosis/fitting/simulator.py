@@ -79,6 +79,7 @@ class Simulator:
     Attributes:
         rollouts: windows simulated so far.
         apart: whether a world costs as much in a small call as in a large one: on a CPU, not on an accelerator.
+        starts: numbers s of a start state: positions and velocities, and those of motors beside their links.
     """
 
     def __init__(self, physics: Physics, windows: Windows, lanes: int | None = None) -> None:
@@ -89,7 +90,9 @@ class Simulator:
         self.nv = int(physics.mj_model.nv)
         self.rollouts = 0
         self._run = programs.Kept(self._many, programs.traced_from(physics, "windows"))
-        self._no_offset = np.zeros((self.lanes, 2 * self.nv), np.float32)
+        self._moving = physics.having("on_motors")
+        self.starts = (4 if self._moving else 2) * self.nv
+        self._no_offset = np.zeros((self.lanes, self.starts), np.float32)
         self._no_force = jnp.asarray(np.zeros((self.lanes, windows.steps, self.nv), np.float32))
         nominal = jnp.asarray(np.asarray(physics.space.nominal, np.float32))
         size = jax.eval_shape(lambda theta: _packed(physics.unseen(theta, None, None, {})), nominal).size
@@ -158,6 +161,8 @@ class Simulator:
         past = past_of(self.physics, world, own.around, active)
         start = jax.tree.map(functools.partial(jnp.where, anew), past.start, _unpacked(before, past.start))
         past = past.replace(start=start, world=past.world if past.steps else start, wanted=past.wanted & anew)
+        if self._moving:
+            past = past.replace(ahead=offset[2 * self.nv :])
         return own, past, past.first
 
     def _moved(self, motion: Motion, offset: jax.Array) -> Motion:
@@ -166,7 +171,7 @@ class Simulator:
         What sensors remember begins there too: with the recorded start, rows that late sensors show of it would keep
         its noise, which no change of the start state takes away.
         """
-        speed = offset[self.nv :]
+        speed = offset[self.nv : 2 * self.nv]
         ahead = (jnp.arange(len(motion.qpos)) - motion.start) * jnp.float32(self.physics.dt)
         away = offset[: self.nv] + ahead[:, None] * speed
         qpos = jax.vmap(functools.partial(integrate, self.physics.mj_model))(motion.qpos, away)
@@ -191,6 +196,18 @@ class Simulator:
         row = jnp.maximum(jnp.arange(count)[:, None], jnp.tile(first, 2))
         return jnp.take_along_axis(errors, row, axis=0)
 
+    def loose(self, theta: Array) -> NDArray[np.bool_]:
+        """`[s]`, which numbers of a start state act: motors stand beside their links where an effect lets them."""
+        out = np.arange(self.starts) < 2 * self.nv
+        acting = self.physics.acting(np.asarray(theta, np.float32)[None])[0]
+        if not any(acting[i] for i in self._moving):
+            return out
+        each = self.physics.split(jnp.asarray(np.asarray(theta, np.float32)))[1]
+        for i in self._moving:
+            own = np.asarray(self.physics.effects[i].transmits(self.physics.sites[i], each[i]))
+            out |= np.concatenate([np.zeros(2 * self.nv, bool), own, own])
+        return out
+
     def run(
         self,
         thetas: Array,
@@ -202,7 +219,7 @@ class Simulator:
 
         Args:
             thetas: `[n, P]`, values of `physics.space`.
-            offsets: `[n, W, 2 nv]`, changes of the measured start states; None: none.
+            offsets: `[n, W, s]`, changes of the measured start states; None: none.
             windows: indices `[W]` of the windows wanted; None: all.
             force: `[n, W, H, nv]`, extra generalised force; None: none.
 
@@ -224,14 +241,14 @@ class Simulator:
         offsets: Array | None = None,
         force: NDArray[np.float32] | None = None,
     ) -> Array:
-        """`run` of worlds one by one: `[m, H, 2 nv]` for indices `[m]` of thetas and windows, offsets `[m, 2 nv]`."""
+        """`run` of worlds one by one: `[m, H, 2 nv]` for indices `[m]` of thetas and windows, offsets `[m, s]`."""
         return self._through([(self.windows.batch, np.asarray(of_window))], thetas, of_theta, offsets, force)
 
     def run_on(self, thetas: Array, offsets: Array, chains: Windows, chain: NDArray[np.int64]) -> Array:
         """Worlds simulated from window to window, each beginning where the one before it ends, by the same program.
 
         Args:
-            thetas: `[m, P]`; offsets: `[m, 2 nv]`, changes of the measured states at the first windows' starts.
+            thetas: `[m, P]`; offsets: `[m, s]`, changes of the measured states at the first windows' starts.
             chains: windows as long as one's own, at most as many at a time; chain: `[m, K]`, each world's in order.
 
         Returns:

@@ -13,7 +13,7 @@ from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, windo
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.fitting import forces
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
+from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate, moving
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, PRIORS
 from bayessim_mjx.diagnosis.statistics import Z90, normal_deviate, times, variance_parts
 
@@ -57,7 +57,7 @@ def linearise(fitter: Fitter, fit: Fit, knots: int | None = None, D: Array | Non
     knots = forces.default_nodes(fitter) if knots is None else knots
     scale = forces.force_scale(fitter)
     D = forces.columns(fitter, fit, knots, scale) if D is None else D
-    q, _ = eliminate(fit.r, np.concatenate([fit.A, D], 2), fit.B, fit.offsets, fitter.spread)
+    q, _ = eliminate(fit.r, np.concatenate([fit.A, D], 2), fit.B, fit.offsets, fit.spread)
     return Linear(D, forces.node_basis(fitter.simulator.windows.steps, D.shape[2] // len(scale)), scale, q)
 
 
@@ -115,7 +115,7 @@ def estimate(fitter: Fitter, fit: Fit, linear: Linear | None = None) -> Disturba
 
 def _learnt(fitter: Fitter, fit: Fit, linear: Linear, r: Array, like: Sequence[Hyper] = ()) -> Learnt:
     channels = int(fitter.used.sum())
-    windows = windows_of(r, fit.A, fit.B, linear.D, fit.offsets, fitter.spread, linear.scale, channels)
+    windows = windows_of(r, fit.A, fit.B, linear.D, fit.offsets, fit.spread, linear.scale, channels)
     return learn(windows, belief_of(fit), like)
 
 
@@ -133,13 +133,15 @@ def _force(linear: Linear, found: Learnt) -> Array:
 
 def _anew(fitter: Fitter, fit: Fit, linear: Linear, found: Learnt) -> tuple[Linear, Array]:
     """(linear model, residuals `[W, n]`) simulated at an estimate and taken back; windows only where it fits better."""
-    force, start = _force(linear, found), _means(found)[:, linear.D.shape[2] :] * fitter.spread
+    force, start = _force(linear, found), np.zeros_like(fit.offsets)
+    own = moving(fit.B)
+    start[:, own] = _means(found)[:, linear.D.shape[2] :] * fit.spread[own]
     theta = fitter.vector(fit.coordinates, fit.values + found.step)
     acting, flat = np.einsum("hm,wmv->whv", linear.basis, force), np.swapaxes(force, 1, 2).reshape(len(force), -1)
     r = fitter.whiten(fitter.simulator.run(theta[None], start[None], force=acting[None]))[0]
     back = r + times(linear.D, flat) + times(fit.B, start - fit.offsets) + fit.A @ found.step
     back = np.where((np.sum(r**2, 1) < np.sum(fit.r**2, 1))[:, None], back, fit.r)
-    q, _ = eliminate(back, np.concatenate([fit.A, linear.D], 2), fit.B, fit.offsets, fitter.spread)
+    q, _ = eliminate(back, np.concatenate([fit.A, linear.D], 2), fit.B, fit.offsets, fit.spread)
     return replace(linear, quadratic=q), back
 
 

@@ -61,7 +61,7 @@ class Located:
 
 def locate(fitter: Fitter, fit: Fit, disturbance: Disturbance | None = None) -> Located:
     """Places of the gap that a fit leaves; `disturbance`: of this fit, None: estimated here."""
-    if of_one(float(fit.quadratic(fitter.spread)[0].c.mean()), fitter.size).at_noise:
+    if of_one(float(fit.quadratic()[0].c.mean()), fitter.size).at_noise:
         return Located()
     disturbance = estimate(fitter, fit) if disturbance is None else disturbance
     windows, model = fitter.simulator.windows, fitter.simulator.physics.mj_model

@@ -59,7 +59,7 @@ def widened(state: SearchState, model: Model, say: Progress) -> Model:
 def promise(state: SearchState, model: Model) -> float:
     """By how much the cost would fall in ranges as wide as they may get, if the model were linear."""
     fit = model.fit
-    q, _ = fit.quadratic(state.fitter.spread)
+    q, _ = fit.quadratic()
     g, S = q.weighted(fit.weight)
     precision, pull, low, high = fit.prior()
     S, g = S + np.diag(precision), g + pull

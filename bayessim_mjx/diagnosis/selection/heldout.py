@@ -94,7 +94,7 @@ class _Fold:
             self.offsets = (self.fit.offsets + self.offsets) / 2
 
     def _step(self, values: Array, offsets: Array, r: Array) -> tuple[Array, Array]:
-        q, starts = eliminate(r, self.fit.A, self.fit.B, offsets, self.fitter.spread)
+        q, starts = eliminate(r, self.fit.A, self.fit.B, offsets, self.fit.spread)
         g, S = q.weighted(self.fit.weight)
         precision, pull, low, high = replace(self.fit, values=values).prior()
         held = HELD_OUT.trust * np.diag(S)
@@ -107,7 +107,7 @@ class _Fold:
         return values + p, offsets + starts.step(self.fit.A, p)
 
 
-def noise_floor(fitter: Fitter, fit: Fit, noise: Array) -> Array:
+def noise_floor(fit: Fit, noise: Array) -> Array:
     """`[W]`, mean square of white noise after start states were fitted to it: tr (I - P) S (I - P)' / n, P their hat.
 
     Start states take a share of the noise with them, 2 of 25 numbers of a joint whose position is measured in 25 rows.
@@ -115,7 +115,7 @@ def noise_floor(fitter: Fitter, fit: Fit, noise: Array) -> Array:
     Args:
         noise: `[C]`, of each channel, in what was estimated from the logs; S has their squares.
     """
-    _, starts = fit.quadratic(fitter.spread)
+    _, starts = fit.quadratic()
     B, M = starts.B, starts.M
     square = np.tile(noise**2, B.shape[1] // len(noise))
     inner = np.einsum("wni,n,wnj->wij", B, square, B)
@@ -139,7 +139,7 @@ def _settled(fitter: Fitter, fit: Fit, thetas: Array, of_theta: NDArray[np.int64
     offsets, none = fit.offsets, np.zeros((*fit.r.shape, 0))
     r = simulated(offsets)
     for _ in range(2):
-        _, starts = eliminate(r, none, fit.B, offsets, fitter.spread)
+        _, starts = eliminate(r, none, fit.B, offsets, fit.spread)
         moved = offsets + starts.step(none, np.zeros(0))
         new = simulated(moved)
         better = (np.sum(new**2, 1) < np.sum(r**2, 1))[:, None]

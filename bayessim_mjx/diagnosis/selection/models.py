@@ -94,7 +94,7 @@ def told_alone(fitter: Fitter, fit: Fit, rest: Rest | None = None) -> list[bool]
 
 def _rest(fitter: Fitter, fit: Fit) -> Rest:
     """Fits without some of the windows."""
-    return Rest(fit.quadratic(fitter.spread)[0], fit.weight, *fit.prior())
+    return Rest(fit.quadratic()[0], fit.weight, *fit.prior())
 
 
 def effective_samples(fit: Fit, fitter: Fitter) -> float:
@@ -118,7 +118,7 @@ def nats(old: Model, new: Model) -> float:
 
 def of_noise(fitter: Fitter, model: Model) -> Array:
     """`[k, k]`, Laplace covariance of the fit if its law were right: of the noise and of what was known before."""
-    q, _ = model.fit.quadratic(fitter.spread)
+    q, _ = model.fit.quadratic()
     _, S = q.weighted(model.fit.weight)
     precision, base = model.fit.belief(), len(fitter.base)
     ranges = np.array([c.high - c.low for c in model.fit.coordinates[:base]])

@@ -60,9 +60,9 @@ def part(fit: Fit, own: NDArray[np.int64]) -> Fit:
 class Projection:
     """The fit's own parameters and start states, projected out of columns and residuals."""
 
-    def __init__(self, fitter: Fitter, fit: Fit) -> None:
+    def __init__(self, fit: Fit) -> None:
         precision, pull, low, high = fit.prior()
-        q, starts = fit.quadratic(fitter.spread)
+        q, starts = fit.quadratic()
         g, S = q.weighted(fit.weight)
         slope = g + pull
         pinned = ((low >= -1e-12) & (slope < 0)) | ((high <= 1e-12) & (slope > 0))
@@ -190,7 +190,7 @@ def screen(
         plans = [plan for turn in turns for plan in turn if plan]
         for column in simulated(fitter, fit, plans, secants.own, say, over):
             secants.columns.setdefault(column.candidate.label, []).append(column)
-    found = judged(fitter, fit, secants.of(candidates), secants.own)
+    found = judged(fit, secants.of(candidates), secants.own)
     return sorted(map(_with_others, found.values()), key=lambda s: -s.gain)
 
 
@@ -228,11 +228,9 @@ def simulated(
         yield from (Column(*plan, change) for plan, change in zip(now, changes, strict=True))
 
 
-def judged(
-    fitter: Fitter, fit: Fit, columns: Iterable[Column], own: NDArray[np.int64]
-) -> dict[str, list[tuple[Screened, Array]]]:
+def judged(fit: Fit, columns: Iterable[Column], own: NDArray[np.int64]) -> dict[str, list[tuple[Screened, Array]]]:
     """{candidate's label: [(what its starting point gains, the point)]}; on another fit without a simulation."""
-    project, share = Projection(fitter, part(fit, own)), len(fit.r) / max(len(own), 1)
+    project, share = Projection(part(fit, own)), len(fit.r) / max(len(own), 1)
     each: dict[str, list[tuple[Screened, Array]]] = {}
     for column in columns:
         one = _one(project, column)

@@ -92,7 +92,7 @@ class SearchState:
         and the effect would find nothing to explain.
         """
         if (
-            not self.rough or np.mean((fit.offsets / self.fitter.spread) ** 2) < 1.0
+            not self.rough or np.mean((fit.offsets / fit.spread) ** 2) < 1.0
         ):  # mean square of start states, in variances
             return fit
         if fit not in self._measured:

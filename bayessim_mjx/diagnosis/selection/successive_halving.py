@@ -202,6 +202,7 @@ class WindowSubset:
     def __init__(self, simulator: Any, own: NDArray[np.int64]) -> None:
         self.simulator, self.own, self.physics = simulator, own, simulator.physics
         self.apart = getattr(simulator, "apart", False)
+        self.starts, self.loose = simulator.starts, simulator.loose
         all_of_it = simulator.windows  # its batch stays whole: the simulator has it
         parts = {name: getattr(all_of_it, name)[own] for name in ("log", "start", "group")}
         self.windows = replace(all_of_it, **parts)
@@ -351,6 +352,4 @@ def cut_back(state: SearchState, model: Model, kept: Sequence[Candidate]) -> Fit
     fit, base = model.fit, len(state.fitter.base)
     names = {c.name for e in kept for c in e.coordinates}
     own = [i for i, c in enumerate(fit.coordinates) if i < base or c.name in names]
-    coordinates = tuple(fit.coordinates[i] for i in own)
-    columns = fit.A[:, :, own]
-    return Fit(coordinates, fit.values[own], fit.offsets, fit.r, columns, fit.B, fit.weight, np.inf, doubt=fit.doubt)
+    return state.fitter.without(fit, own)

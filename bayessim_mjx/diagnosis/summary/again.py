@@ -136,7 +136,7 @@ def _drawn(found: Findings, stages: Sequence[str], law: Array, w: int) -> tuple[
     values = [_values(found, s, w) for s in stages]
     offsets = [found.predictions[s].offsets[w] for s in stages]
     B, last = models[-1].fit.B[w], models[-1]
-    start = np.linalg.cholesky(np.linalg.inv(B.T @ B + np.diag(1 / fitter.spread**2)))
+    start = np.linalg.cholesky(np.linalg.inv(B.T @ B + np.diag(1 / last.fit.spread**2)))
     moved = offsets[-1] + rng.normal(size=(SEVERAL, len(start))) @ start.T
     off = values[-1] + rng.normal(size=(SEVERAL, len(values[-1]))) @ law.T
     ends = np.array([(c.low, c.high) for c in last.fit.coordinates]).reshape(-1, 2).T

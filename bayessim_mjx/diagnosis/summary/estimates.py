@@ -105,7 +105,7 @@ def _closed(found: Findings) -> heldout.Closed:
         if chosen != answer:
             own, models = cut.group == condition, selection.state.models
             after[own] = before[own] * models[chosen].cost[own] / models[frozenset()].cost[own]
-    floor = heldout.noise_floor(found.setup.fitter, found.model.fit, selection.estimated.noise)
+    floor = heldout.noise_floor(found.model.fit, selection.estimated.noise)
     return heldout.Closed(before, after, cut.condition, floor)
 
 
@@ -283,7 +283,7 @@ def _at_bound(c: Coordinate, value: float) -> bool:
 
 def per_condition(fitter: Fitter, model: Model) -> tuple[Array, Array]:
     """Estimates and standard deviations `[G, k]` of each condition alone, one Newton step from the common fit."""
-    q, _ = model.fit.quadratic(fitter.spread)
+    q, _ = model.fit.quadratic()
     _, _, low, high = model.fit.prior()
     precision = model.fit.belief()
     pull = precision * (np.array([c.neutral for c in model.fit.coordinates]) - model.fit.values)

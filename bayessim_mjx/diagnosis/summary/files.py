@@ -127,7 +127,7 @@ def write_preliminary(path: Path, about: Mapping[str, Any], setup: Setup, state:
 def _so_far(state: SearchState) -> dict[str, Any]:
     """Gaps in noise standard deviations, recalibrated parameters and the best models."""
     fit, calibrated = state.base.fit, state.gap(state.base)
-    nominal, _ = state.nominal.quadratic(state.fitter.spread)
+    nominal, _ = state.nominal.quadratic()
     best = [
         {k: row[k] for k in ("label", "score", "se", "gap_closed", "parameters")} for row in assemble.ranking(state)
     ]

@@ -136,7 +136,7 @@ def repeats(fitter: Fitter, fit: Fit, logs: Sequence[Log]) -> tuple[Prediction, 
     for w, partner in _pairs(fitter, logs):
         rows = slice(int(cut.start[w]) + 1, int(cut.start[w]) + 1 + cut.steps)
         d = _apart(model, cut.logs[cut.log[w]], cut.logs[partner], rows)[:, fitter.used] / fitter.sigma / np.sqrt(2)
-        error, offset = _settled(d, fit.B[w], fitter.spread)
+        error, offset = _settled(d, fit.B[w], fit.spread)
         errors.append(error)
         offsets.append(offset)
         group.append(cut.group[w])

@@ -142,7 +142,7 @@ def _explained(found: Findings, noise: Origin | None) -> str:
     if noise is not None or found.selection.force.noise > FLOOR**2:
         return "noise"
     calibrated = state.gap(state.base)
-    q, _ = state.nominal.quadratic(state.fitter.spread)
+    q, _ = state.nominal.quadratic()
     nominal = of_one(float(q.c.sum()), calibrated.noise)
     return "parameters" if nominal.rms > FLOOR and nominal.after > 1.1 * calibrated.after else "no_gap"
 

@@ -191,6 +191,16 @@ def shown(at: Site, memory: Any, measurement: Measurement, on: jax.Array, encode
     return {"qpos": qpos, "qvel": measurement["qvel"].at[at.dadr].add(jnp.where(on, encoder * slip, 0.0))}
 
 
+def moved(
+    at: Site, memory: Any, state: Measurement, ahead: Measurement, on: jax.Array, encoder: jax.Array
+) -> tuple[dict[str, jax.Array], Measurement]:
+    """Move motors further ahead of their links, and whichever of both the encoder does not see."""
+    twist, slip = (jnp.where(on, ahead[what][at.dadr], 0.0) for what in ("qpos", "qvel"))
+    memory = {**memory, "twist": memory["twist"] + twist, "speed": memory["speed"] + (1.0 - encoder) * slip}
+    qpos = state["qpos"].at[at.qadr].add(-encoder * twist)
+    return memory, {"qpos": qpos, "qvel": state["qvel"].at[at.dadr].add(-encoder * slip)}
+
+
 class Passed(NamedTuple):
     """At the end of a sub-step, `[n]`: torque through the transmission, change of the links' speed, motor's slip."""
 
@@ -308,8 +318,16 @@ class OfTransmission:
     def on_record(
         self, at: Site, memory: Any, before: Measurement, after: Measurement, theta: jax.Array
     ) -> tuple[Any, Measurement]:
+        return recorded(at, memory, before, after, self.on(at, theta), self._encoder(at, theta))
+
+    def on_motors(
+        self, at: Site, memory: Any, state: Measurement, ahead: Measurement, theta: jax.Array
+    ) -> tuple[Any, Measurement]:
+        return moved(at, memory, state, ahead, self.on(at, theta), self._encoder(at, theta))
+
+    def _encoder(self, at: Site, theta: jax.Array) -> jax.Array:
         encoder = self.encoder(at, theta)
-        return recorded(at, memory, before, after, self.on(at, theta), jnp.float32(0.0) if encoder is None else encoder)
+        return jnp.zeros(len(at)) if encoder is None else encoder
 
     def on_measurement(
         self, at: Site, memory: Any, measurement: Measurement, theta: jax.Array

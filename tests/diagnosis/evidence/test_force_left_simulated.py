@@ -17,7 +17,7 @@ def left(logs):
     fitter, fit = fitted(logs)
     scale = disturbance.force_scale(fitter)
     D = disturbance.columns(fitter, fit, disturbance.default_nodes(fitter), scale)
-    windows = windows_of(fit.r, fit.A, fit.B, D, fit.offsets, fitter.spread, scale, int(fitter.used.sum()))
+    windows = windows_of(fit.r, fit.A, fit.B, D, fit.offsets, fit.spread, scale, int(fitter.used.sum()))
     return force_left(windows, belief_of(fit), learn(windows, belief_of(fit)), scale)
 
 

@@ -54,9 +54,18 @@ def test_numbers_take_common_errors_as_a_fit_to_them_would():
     case, hyper = draw(3, k=3), Hyper(np.array([0.02]), 4.0, np.array([1.0, 1.2]))
     count, errors = len(case.r), np.random.default_rng(1).normal(size=(*case.r.shape, 2))
     coordinates = tuple(Coordinate(str(i), (i,), 0.0, -50.0, 50.0, 1.0) for i in range(3))
-    fit = Fit(coordinates, np.zeros(3), np.zeros((count, STARTS)), case.r, case.A, case.B, np.ones(count), 0.0)
+    fit = Fit(
+        coordinates,
+        np.zeros(3),
+        np.zeros((count, STARTS)),
+        case.r,
+        case.A,
+        case.B,
+        np.ones(count),
+        0.0,
+        spread=np.full(STARTS, SPREAD),
+    )
     weighing = Weighing.__new__(Weighing)
-    weighing.state = SimpleNamespace(fitter=SimpleNamespace(spread=np.full(STARTS, SPREAD)))
     weighing.D, weighing.scale, weighing.channels = case.D, case.scale, CHANNELS
 
     def best(r):

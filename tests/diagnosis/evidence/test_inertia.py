@@ -35,7 +35,9 @@ def fitter():
     model = mujoco.MjModel.from_xml_string(XML)
     space = robot.default_space(model)
     physics = Physics(model, 0.02, space, [make("payload", "lower"), make("inertial_parameters", "lower")])
-    return Fitter(SimpleNamespace(physics=physics, windows=Windows()), base_coordinates(space), physics.neutral)
+    return Fitter(
+        SimpleNamespace(physics=physics, windows=Windows(), starts=4), base_coordinates(space), physics.neutral
+    )
 
 
 def model_of(at, law, known, own):

@@ -35,7 +35,7 @@ def toy() -> SimpleNamespace:
         return np.stack([r - sum(t[i] * c for i, c in enumerate(columns.values())) for t in thetas])
 
     fitter = SimpleNamespace(
-        base=(), spread=np.ones(1), whiten=lambda errors: errors,
+        base=(), whiten=lambda errors: errors,
         simulator=SimpleNamespace(run=run, windows=SimpleNamespace(group=group)),
         vector=lambda coordinates, values: np.array([
             dict(zip([c.name for c in coordinates], values, strict=True)).get(n, 0.0) for n in TRUTH
@@ -43,7 +43,7 @@ def toy() -> SimpleNamespace:
     )  # fmt: skip
     start = np.zeros((len(group), 1))
     B = np.zeros((len(group), STEPS, 1))
-    fit = Fit((), np.zeros(0), start, r, np.zeros((*r.shape, 0)), B, np.ones(len(group)), 0.0)
+    fit = Fit((), np.zeros(0), start, r, np.zeros((*r.shape, 0)), B, np.ones(len(group)), 0.0, spread=np.ones(1))
     effects = [Candidate(n, "joint", "joint", (c,), (False,)) for n, c in coordinates.items()]
     screened = [SimpleNamespace(candidate=e, start=np.array([0.7 * TRUTH[e.effect]])) for e in effects]
     base = SimpleNamespace(fit=fit)

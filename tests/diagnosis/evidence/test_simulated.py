@@ -62,7 +62,7 @@ def _sampled(found, key):
     for p in np.atleast_2d(proposal.rvs(draws, random_state=rng)):
         theta = fitter.vector(fixed.coordinates, fixed.values + p)
         r = fitter.whiten(fitter.simulator.run(theta[None], fixed.offsets[None]))[0]
-        sizes = fitter.spread, weighing.scale, weighing.channels
+        sizes = fit.spread, weighing.scale, weighing.channels
         there = marginal(windows_of(r, fit.A[:, :, own:], fit.B, weighing.D, fit.offsets, *sizes), learnt.hyper)
         Q = there.Q.sum(0)  # of the residual and what simulators differ by, whose priors are standard normal
         whole = Q[1:, 1:] + np.eye(len(Q) - 1)

@@ -8,6 +8,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
+from tests.diagnosis.rigid import Rigid
 
 TIMES = np.arange(8 * 20).reshape(8, 20)
 ALONG, ACROSS = np.sin(0.7 * TIMES), np.sin(0.7 * TIMES + 1.0)
@@ -25,7 +26,7 @@ class Windows:
         return 8
 
 
-class Loaded:
+class Loaded(Rigid):
     """The error is (LOAD - load) ALONG + 3 (load arm^2 - LOAD ARM^2) ACROSS, as of a mass off its plane."""
 
     windows, physics = Windows(), SimpleNamespace()

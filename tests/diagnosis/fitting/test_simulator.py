@@ -125,7 +125,7 @@ def test_windows_one_after_the_other_are_one_long_window(tmp_path):
     own, physics = ready.fitter.simulator, ready.physics
     rng, first = np.random.default_rng(0), int(own.windows.start[0])
     thetas = np.array([rng.uniform(p.low, p.high, 3) for p in physics.space.parameters]).T
-    offsets, of_log = 0.01 * rng.normal(size=(3, 2)), np.array([1, 0, 1])
+    offsets, of_log = 0.01 * rng.normal(size=(3, own.starts)), np.array([1, 0, 1])
 
     def cut(starts, length):
         given = own.windows.dt, physics.substeps, length

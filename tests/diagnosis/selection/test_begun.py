@@ -27,7 +27,7 @@ class Begun:
 
 def fit(values, offsets):
     none = np.zeros(0)
-    return Fit((), np.asarray(values), offsets, none, none, none, np.ones(4), 1.0)
+    return Fit((), np.asarray(values), offsets, none, none, none, np.ones(4), 1.0, spread=SPREAD)
 
 
 def begun(monkeypatch, offsets, contacts):

@@ -14,11 +14,12 @@ from bayessim_mjx.diagnosis.selection.models import scored
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, Settings
 from bayessim_mjx.effects.effect import Quantity
 from bayessim_mjx.report import words
+from tests.diagnosis.rigid import Rigid
 
 MOTION = np.sin(np.arange(8 * 20) * 0.7).reshape(8, 20)  # of eight windows; their error is value * MOTION
 
 
-class Linear:
+class Linear(Rigid):
     """Windows whose error is (true - theta[0]) MOTION plus noise of 0.01, in place of a simulator."""
 
     def __init__(self, true, quantity, low, high):

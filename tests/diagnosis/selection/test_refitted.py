@@ -11,12 +11,13 @@ from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.selection import heldout
 from bayessim_mjx.diagnosis.selection.models import scored, told_alone
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT
+from tests.diagnosis.rigid import Rigid
 
 MOTION = np.sin(np.arange(8 * 20) * 0.7).reshape(8, 20)  # of eight windows
 GROUP = np.repeat(np.arange(4), 2)
 
 
-class Bent:
+class Bent(Rigid):
     """Windows whose error is (what theta does in truth - what it does) MOTION; conditions differ in their truth."""
 
     def __init__(self, true, roughness=0.0, felt=1.0, bend=0.4, start=0.0):

@@ -113,11 +113,11 @@ def test_the_noise_floor_is_what_noise_leaves_after_start_states_were_fitted_to_
     rng = np.random.default_rng(1)
     B = np.repeat(rng.normal(size=(1, 12, 2)), 4000, 0)
     r = rng.normal(size=(4000, 12)) * np.tile(noise, 12 // len(noise))
-    fitter = SimpleNamespace(spread=np.full(2, spread))
-    fit = Fit((), np.zeros(0), np.zeros((4000, 2)), r, np.zeros((4000, 12, 0)), B, np.ones(4000), 0.0)
-    _, starts = fit.quadratic(fitter.spread)
+    x, A, every = np.zeros((4000, 2)), np.zeros((4000, 12, 0)), np.ones(4000)
+    fit = Fit((), np.zeros(0), x, r, A, B, every, 0.0, spread=np.full(2, spread))
+    _, starts = fit.quadratic()
     left = r - np.einsum("wns,ws->wn", B, starts.step(fit.A, np.zeros(0)))
-    floor = heldout.noise_floor(fitter, fit, np.array(noise))
+    floor = heldout.noise_floor(fit, np.array(noise))
     assert floor == pytest.approx(np.mean(left**2), abs=0.02)
     if noise == (1.0,):
         assert floor[0] == pytest.approx(10 / 12, abs=1e-3) if spread > 1 else floor[0] > 0.87

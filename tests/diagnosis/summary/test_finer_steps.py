@@ -39,7 +39,7 @@ def test_where_parameters_would_go_at_finer_steps_is_where_the_truth_is(tmp_path
     shift = again._shift(found)
     damping, armature, mass = np.abs(fit.values - SCALE)
     assert armature > 0.01
-    _, S = fit.quadratic(fitter.spread)[0].weighted(fit.weight)
+    _, S = fit.quadratic()[0].weighted(fit.weight)
     noise = np.sqrt(np.linalg.inv(S)[1, 1])  # of the estimate: a fit to other noise of the sensors lies elsewhere
     assert noise < armature / 4
     assert abs(fit.values[1] + shift[1] - SCALE[1]) < armature / 4 + noise
@@ -48,7 +48,7 @@ def test_where_parameters_would_go_at_finer_steps_is_where_the_truth_is(tmp_path
 
 def likeliest(fit, fitter):
     """The step beside white noise alone."""
-    g, S = fit.quadratic(fitter.spread)[0].weighted(fit.weight)
+    g, S = fit.quadratic()[0].weighted(fit.weight)
     precision, pull, low, high = fit.prior()
     return solve(S + np.diag(precision), g + pull, low, high)
 
