@@ -24,7 +24,7 @@ def verdict_on(left: ForceLeft, calibrated=3.0, effects=("x",), coasting=None, n
     class State:
         base = None
         fitter = SimpleNamespace(spread=None)
-        nominal = SimpleNamespace(quadratic=lambda spread: (SimpleNamespace(c=np.array([rms**2])), None))
+        nominal = SimpleNamespace(quadratic=lambda: (SimpleNamespace(c=np.array([rms**2])), None))
 
         def gap(self, model):
             return SimpleNamespace(noise=1.0, after=calibrated**2)
