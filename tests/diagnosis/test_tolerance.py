@@ -235,9 +235,7 @@ def test_the_floor_is_what_repeats_differ_by(monkeypatch):
         logs=logs, log=np.zeros(count, int), start=np.arange(count) * steps, steps=steps, group=np.zeros(count, int)
     )
     simulator = SimpleNamespace(windows=cut, physics=SimpleNamespace(mj_model=model))
-    fitter = SimpleNamespace(
-        simulator=simulator, used=np.array([True, False]), sigma=np.array([sigma])
-    )
+    fitter = SimpleNamespace(simulator=simulator, used=np.array([True, False]), sigma=np.array([sigma]))
     fit = SimpleNamespace(B=B, offsets=np.zeros((count, 2)), spread=np.array([10.0, 10.0]))
     monkeypatch.setattr(how_far.noise, "repeats", lambda logs: [logs[:2]])
     prediction, group = how_far.repeats(fitter, fit, logs)

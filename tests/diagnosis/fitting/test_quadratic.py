@@ -184,3 +184,28 @@ def test_an_effect_felt_in_one_window_alone_is_predicted_from_block_to_block():
 def test_a_parameter_that_only_fits_noise_gains_nothing_from_block_to_block():
     gains = [np.subtract(*one_window_tells(truth=0.0, seed=seed)) for seed in range(20)]
     assert np.mean(gains) < 0.0  # whole: left where it was; block by block: one fitted number costs about 1
+
+
+def test_start_states_that_move_nothing_stay_what_they_were_believed_to_be():
+    """They are left out of the algebra: the same costs and steps as dense algebra with their columns of zeros."""
+    r, A, B, x, spread = problem(3)
+    B = np.concatenate([B[:, :, :1], np.zeros((W, N, 2)), B[:, :, 1:]], 2)
+    x, spread = np.concatenate([x[:, :1], np.zeros((W, 2)), x[:, 1:]], 1), np.insert(spread, 1, [0.5, 2.0])
+    x[:, 2] = 0.7
+    q, starts = quadratic.eliminate(r, A, B, x, spread)
+    p = np.random.default_rng(4).normal(size=K)
+    long_way = [dense(r[w], A[w], B[w], x[w], spread, p) for w in range(W)]
+    np.testing.assert_allclose(q.at(p), [cost for cost, _ in long_way])
+    np.testing.assert_allclose(starts.step(A, p), [dx for _, dx in long_way], atol=1e-12)
+
+
+# one that noise hides (sd .29) is found slowly, from above
+@pytest.mark.parametrize(("size", "within"), [(0.2, 0.25), (1.0, 0.06), (5.0, 0.06)])
+def test_the_spread_of_start_states_is_learnt_from_many_windows(size, within):
+    """Of 4000 windows, begun at another spread; numbers that are not asked for keep theirs."""
+    rng, count, first = np.random.default_rng(0), 4000, np.array([1.0, 1.0])
+    B = rng.normal(size=(count, N, 2))
+    true = rng.normal(size=(count, 2)) * np.array([1.0, size])
+    r = np.einsum("wns,ws->wn", B, true) + rng.normal(size=(count, N))
+    found = quadratic.learnt_spread(r, B, np.zeros((count, 2)), first, np.ones(count), np.array([1]))
+    assert found[0] == 1.0 and found[1] == pytest.approx(size, rel=within)
