@@ -93,7 +93,7 @@ class Scales:
 
 
 def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, float] | None = None) -> Scales:
-    """Scales from logs on an even grid; forces by inverse dynamics of the measured motion, and from the commands.
+    """Scales from logs on an even grid; forces by inverse dynamics of the measured motion, and those of the drives.
 
     Args:
         rating: {body: kg} that the robot is rated to carry there.
@@ -101,29 +101,23 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
     speed = np.maximum(_large([log.qvel for log in logs]), 1e-6)
     ptp = np.max([_span(model, log) for log in logs], axis=0)
     command = _large([log.ctrl for log in logs])
-    force, inertia, places = _along(model, logs)
+    force, effort, inertia, places = _along(model, logs)
     groups = bound(model, [log.qpos[len(log) // 2] for log in logs])
     force = passed_on(force, speed, groups)
-    effort = np.zeros(model.nu)
     for i in range(model.nu):
-        gear = float(model.actuator_gear[i, 0]) or 1.0
-        joint, on_joint = int(model.actuator_trnid[i, 0]), drives.dof_of(model, i) is not None
-        needed = float(force[model.jnt_dofadr[joint]]) / abs(gear) if on_joint else 0.0
-        direct = command[i] * abs(float(model.actuator_gainprm[i, 0])) if model.actuator_biasprm[i, 1] == 0 else 0.0
-        effort[i] = max(needed, direct, 1e-9)
-        if on_joint:
-            force[model.jnt_dofadr[joint]] = max(force[model.jnt_dofadr[joint]], direct * abs(gear))
+        if (dof := drives.dof_of(model, i)) is not None:
+            effort[i] = max(effort[i], force[dof] / (abs(float(model.actuator_gear[i, 0])) or 1.0))
     noise = np.sqrt(np.mean([log.sigma_dofs**2 for log in logs], axis=0))
     loops = drives.loops_of(model, logs)
     read = read_by(model, logs, loops)
     return Scales(
         model=model,
-        force=np.maximum(passed_on(force, speed, groups), 1e-9),
+        force=np.maximum(force, 1e-9),
         speed=speed,
         travel=np.maximum(ptp / 2, 1e-6),
         inertia=np.maximum(inertia, 1e-12),
         command=np.maximum(command, 1e-9),
-        effort=effort,
+        effort=np.maximum(effort, 1e-9),
         moves=ptp > 10 * noise + 1e-9,
         read=read,
         carried=drives.carried(model, places, rating),
@@ -133,33 +127,36 @@ def measure(model: mujoco.MjModel, logs: Sequence[Log], rating: Mapping[int, flo
     )
 
 
-def _along(model: mujoco.MjModel, logs: Sequence[Log]) -> tuple[Array, Array, Array]:
-    """Return (forces `[nv]` that the motion needs, with loops open; mean inertia `[nv]`; poses `[n, nq]`).
+def _along(model: mujoco.MjModel, logs: Sequence[Log]) -> tuple[Array, Array, Array, Array]:
+    """Return (forces `[nv]`, efforts of actuators `[nu]`, mean inertia `[nv]`, poses `[n, nq]`) along the logs.
 
-    Noise breaks a loop a little, and its stiff constraint would answer with forces far beyond those of the drives.
+    Forces are those that the motion needs, or the drives exert on it if that is more: what drag or friction holds at a
+    steady speed needs none by a model without them. Loops are open: noise breaks them a little, and their stiff
+    constraint would answer with forces far beyond those of the drives.
     """
     model = copy.copy(model)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
     data = mujoco.MjData(model)
-    torque, driven, inertia, places = [], [], [], []
-    floats = np.flatnonzero(model.jnt_type[model.dof_jntid] == int(mujoco.mjtJoint.mjJNT_FREE))
+    needed, driven, effort, inertia, places = [], [], [], [], []
+    integrates = model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
     for log in logs:
-        ctrl = drives.controlled(log, model) if len(floats) else log.ctrl
-        acceleration = np.gradient(log.qvel, log.time, axis=0)
+        ctrl, acceleration = drives.controlled(log, model), np.gradient(log.qvel, log.time, axis=0)
         for k in range(0, len(log), max(1, len(log) // 100)):
             places.append(log.qpos[k])
             data.qpos[:], data.qvel[:], data.qacc[:] = log.qpos[k], log.qvel[k], acceleration[k]
             mujoco.mj_inverse(model, data)
-            torque.append(np.abs(data.qfrc_inverse))
-            if len(floats):
-                data.ctrl[:] = ctrl[k]
-                mujoco.mj_fwdActuation(model, data)
-                driven.append(np.abs(data.qfrc_actuator))
+            needed.append(np.abs(data.qfrc_inverse))
             inertia.append(np.diag(mass_matrix(model, data)))
-    force = np.percentile(torque, LIMITS.large, axis=0)
-    if len(floats):  # a body that drag holds at a steady speed needs no force by a model without drag
-        force[floats] = np.maximum(force[floats], np.percentile(driven, LIMITS.large, axis=0)[floats])
-    return force, np.mean(inertia, axis=0), np.array(places)
+            data.ctrl[:] = ctrl[k]
+            for i in np.flatnonzero(
+                model.actuator_actadr >= 0
+            ):  # at rest: a filter at its input, a target at the joint
+                data.act[model.actuator_actadr[i]] = data.actuator_length[i] if integrates[i] else ctrl[k, i]
+            mujoco.mj_fwdActuation(model, data)
+            driven.append(np.abs(data.qfrc_actuator))
+            effort.append(np.abs(data.actuator_force))
+    force = np.maximum(_large([np.array(needed)]), _large([np.array(driven)]))
+    return force, _large([np.array(effort)]), np.mean(inertia, axis=0), np.array(places)
 
 
 def bound(model: mujoco.MjModel, poses: Sequence[Array]) -> NDArray[np.int64]:

@@ -88,7 +88,7 @@ def test_forces_of_a_loop_are_as_large_as_its_drive_makes_them(tmp_path):
     model, log = recorded(tmp_path, MIMIC, "left")
     drive = np.percentile(np.abs(log.ctrl), 98)
     left, right = scales.measure(model, [log]).force
-    assert drive <= left < 1.5 * drive
+    assert 0.98 * drive <= left < 1.5 * drive  # of a hundred rows a log
     assert right == pytest.approx(left / 1.5, rel=0.05)  # at 1.5 times the speed: the same power
 
 
