@@ -14,7 +14,7 @@ from bayessim_mjx.effects.support.substep import SubStep
 
 RATIO = 0.7  # damping of the teeth, of critical: "teeth do not bounce"; not counted
 TEETH = Quantity(
-    "compliance", 0.0, 0.0, 0.01, unit="rad/(N m)", per="1/force", reach=(0.0, 0.03), grid=(0.1,), shape=True,
+    "compliance", 0.0, 0.0, 0.01, unit="rad/(N m)", per="1/force", reach=(0.0, 0.03), grid=(0.0, 0.1), shape=True,
     optional=True,
 )  # fmt: skip
 
