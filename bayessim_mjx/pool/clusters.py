@@ -117,6 +117,8 @@ def _slurm(where: str, workers: int) -> Any:
         raise UserError(f'{FLAG} {where} needs dask-jobqueue: pip install "bayessim-mjx[cluster]"') from None
     try:
         settings = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if not isinstance(settings, dict):
+            raise TypeError("no mapping of names to values")
         jobs = SLURMCluster(**({"cores": 1, "processes": 1} | settings))
         jobs.job_script()  # what is wrong with a job's settings is said now, not by the first job
     except (TypeError, ValueError, yaml.YAMLError) as error:

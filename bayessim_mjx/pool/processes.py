@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -18,6 +19,8 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.pool.cores import Cores, allowed, shares
 
 FORGIVEN = 3  # deaths of processes at the same call; Dask's `allowed-failures` has this value too
+
+GRACE = 2.0  # s, for a call to end what it has started
 
 
 class Stopping(Executor):
@@ -112,7 +115,9 @@ def _begin(output: Path | None, environment: dict[str, str]) -> None:
 
 
 def _end_with_the_pool() -> None:
-    """Wait until the pool's process is gone, also by SIGKILL, of which nobody else says anything here."""
+    """Wait until the pool's process is gone, also by SIGKILL; then stop the call and end."""
     if parent := multiprocessing.parent_process():
         parent.join()
         os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(GRACE)
+        os._exit(1)
