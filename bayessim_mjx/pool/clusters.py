@@ -91,9 +91,9 @@ def connected(where: str, workers: int | None, most: int) -> Dask:
     except ImportError:
         raise UserError(f'{FLAG} {where} needs Dask: pip install "bayessim-mjx[cluster]"') from None
     if where == "local":
-        own = distributed.LocalCluster(
-            n_workers=workers or min(device.cores(), most), threads_per_worker=1, dashboard_address=None
-        )
+        count = workers or min(device.cores(), most)
+        own = distributed.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None)
+        own.adapt(minimum=count, maximum=count)  # Dask's nanny gives a worker up that dies while it starts
         return Dask(where, distributed.Client(own), own)
     if where.startswith("slurm:"):
         own = _slurm(where, workers or most)

@@ -38,11 +38,12 @@ class Processes(Stopping):
 
     Args:
         workers: how many; folder: takes what they print, as worker_K.txt. None: they print where this process does.
+        share: whether each has cores of its own, which others get while it waits.
     """
 
-    def __init__(self, workers: int, folder: Path | None = None) -> None:
+    def __init__(self, workers: int, folder: Path | None = None, share: bool = True) -> None:
         self.folder, self._threads, self._own = folder, ThreadPoolExecutor(workers), threading.local()
-        self._cores, self._numbers = Cores(shares(allowed(), workers)), itertools.count()
+        self._cores, self._numbers = Cores(shares(allowed(), workers) if share else []), itertools.count()
         self._pools, self._pids = dict[int, ProcessPoolExecutor](), dict[int, int]()
         self._waiting, self._over, self._lock = 0, False, threading.Lock()
 

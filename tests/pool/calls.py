@@ -20,6 +20,7 @@ def dies_once(folder: Path, x: int) -> int:
 
 
 def dies(x: int) -> None:
+    time.sleep(1.0)  # Dask gives up a worker that dies while it starts
     os.kill(os.getpid(), signal.SIGKILL)
 
 
