@@ -60,7 +60,8 @@ def _cases(group: Any) -> None:
     group.add_argument("--accuracy", metavar="SHARE", type=_share, default=0.05, help=text)
     group.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed")
     text = "cases at a time, which share the cores out (default: as many as cores, and as need not wait for others)"
-    pool.flags(group, text, cli.whole(1, 1024))
+    group.add_argument("--workers", metavar="N", type=cli.whole(1, 1024), help=text)
+    group.add_argument("--cluster", **pool.CLUSTER)
 
 
 def _diagnosis(group: Any) -> None:

@@ -1,15 +1,13 @@
 """Many calls at a time, as a `concurrent.futures.Executor`: processes of this machine, or Dask's on a cluster."""
 
-import argparse
-from collections.abc import Callable
 from pathlib import Path
 
 from bayessim_mjx import device
-from bayessim_mjx.pool.clusters import FLAG, HELP, cluster, connected
+from bayessim_mjx.pool.clusters import CLUSTER, connected
 from bayessim_mjx.pool.commands import alone
 from bayessim_mjx.pool.processes import Processes, Stopping
 
-__all__ = ["Stopping", "alone", "cluster", "executor", "flags"]
+__all__ = ["CLUSTER", "Stopping", "alone", "executor"]
 
 
 def executor(
@@ -20,7 +18,7 @@ def executor(
     A process that dies is replaced, and its call runs again. Left by an error, the block ends what still runs.
 
     Args:
-        where: "": processes of this machine; else a cluster, see `cluster`.
+        where: "": processes of this machine; else a cluster, see `clusters.cluster`.
         workers: calls at a time; None: as many as cores, or as the cluster gives.
         most: calls that can be under way at a time. folder: where processes of this machine write what they print.
         share: whether they share its cores out; a call by `alone` takes one itself.
@@ -31,9 +29,3 @@ def executor(
     if not where:
         return Processes(workers or min(device.cores(), most), folder, share)
     return connected(where, workers, most)
-
-
-def flags(parser: argparse._ActionsContainer, workers: str, limit: Callable[[str], int] = int) -> None:
-    """Add --workers, with this text and type, and --cluster; `executor` takes both."""
-    parser.add_argument("--workers", metavar="N", type=limit, help=workers)
-    parser.add_argument(FLAG, metavar="WHERE", type=cluster, default="", help=HELP)

@@ -41,6 +41,9 @@ def cluster(text: str) -> str:
     return text
 
 
+CLUSTER: dict[str, Any] = {"metavar": "WHERE", "type": cluster, "default": "", "help": HELP}  # of the flag --cluster
+
+
 class Dask(Stopping):
     """Calls by a Dask client.
 

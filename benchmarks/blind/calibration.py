@@ -153,7 +153,8 @@ def main() -> None:
     parser.add_argument("--checks", type=int, default=200, help="of each setting")
     parser.add_argument("--only", default="", help="settings that begin with one of these words, separated by commas")
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    pool.flags(parser, "checks at a time (default: as many as cores)")
+    parser.add_argument("--workers", type=int, help="checks at a time (default: as many as cores)")
+    parser.add_argument("--cluster", **pool.CLUSTER)
     args = parser.parse_args()
     words = tuple(args.only.split(",")) if args.only else ("",)
     print("| true curves | 90 % intervals hold | high over low | median error | told over true | found at the told strength | checks, thresholds |")  # fmt: skip # noqa: E501

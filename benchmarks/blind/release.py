@@ -64,7 +64,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of cases and answers; goes on where it stopped")
     parser.add_argument("--seeds", required=True, help="first:last, last not included")
     parser.add_argument("--systems", default="pendulum,two_link", help=f"of {', '.join(SYSTEMS)}")
-    pool.flags(parser, "cases at a time (default: as many as cores)")
+    parser.add_argument("--workers", type=int, help="cases at a time (default: as many as cores)")
+    parser.add_argument("--cluster", **pool.CLUSTER)
     args = parser.parse_args()
     first, last = (int(n) for n in args.seeds.split(":"))
     counted = json.loads(RECORD.read_text()) if RECORD.exists() else []

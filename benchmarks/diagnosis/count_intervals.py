@@ -215,7 +215,8 @@ def _parser() -> argparse.ArgumentParser:
     for name, text in (("run", "cases without a result"), ("isolable", "rivals of the hidden effects, by the truth")):
         several = commands.add_parser(name, help=text)
         several.add_argument("out", type=Path)
-        pool.flags(several, "cases at once, one core each (default: as many as cores)")
+        several.add_argument("--workers", type=int, help="cases at once, one core each (default: as many as cores)")
+        several.add_argument("--cluster", **pool.CLUSTER)
         several.add_argument("--minutes", type=float, default=1e6, help="when they are over, running cases are killed")
         several.add_argument("--only", choices=("all", "sheets", "logs", "outside", "frozen"), default="all")
         several.add_argument("--systems", default="", help="some robots, separated by commas; default all")

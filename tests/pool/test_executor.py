@@ -13,6 +13,7 @@ import pytest
 
 from bayessim_mjx import pool
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.pool.clusters import cluster
 from tests.pool import calls
 
 needs_dask = pytest.mark.skipif(
@@ -117,19 +118,19 @@ def _gone(process: int) -> bool:
 )
 def test_what_is_no_cluster_is_refused_with_what_is_allowed(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match=f"'{text}': allowed: tcp://HOST:PORT.*slurm:FILE.*or local"):
-        pool.cluster(text)
+        cluster(text)
 
 
 @pytest.mark.parametrize("text", ["", "local", "tcp://10.0.0.1:8786", "tls://head.site:80", "tcp://[::1]:8786"])
 def test_what_is_a_cluster_is_taken(text: str) -> None:
-    assert pool.cluster(text) == text
+    assert cluster(text) == text
 
 
 def test_a_file_of_settings_has_to_be_there(tmp_path: Path) -> None:
     (tmp_path / "jobs.yaml").write_text("cores: 1\n")
-    assert pool.cluster(f"slurm:{tmp_path}/jobs.yaml") == f"slurm:{tmp_path}/jobs.yaml"
+    assert cluster(f"slurm:{tmp_path}/jobs.yaml") == f"slurm:{tmp_path}/jobs.yaml"
     with pytest.raises(argparse.ArgumentTypeError, match="there is no file"):
-        pool.cluster(f"slurm:{tmp_path}/no.yaml")
+        cluster(f"slurm:{tmp_path}/no.yaml")
 
 
 def test_without_the_extra_its_name_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
