@@ -11,7 +11,7 @@ RUN apt-get update && apt-get install -y --no-install-recommends git libosmesa6 
 
 ARG ACCEL=cpu
 COPY . /src
-RUN if [ "$ACCEL" = cuda ]; then extras="cuda,export"; else extras="export"; fi \
+RUN if [ "$ACCEL" = cuda ]; then extras="cuda,export,cluster"; else extras="export,cluster"; fi \
     && pip install --no-cache-dir "/src[$extras]" && rm -rf /src
 
 # compiled programs are kept beside the logs

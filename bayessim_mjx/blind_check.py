@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from bayessim_mjx import cli
+from bayessim_mjx import cli, pool
 from bayessim_mjx.config.settings import SEEDS
 from bayessim_mjx.errors import UserError
 
@@ -61,6 +61,7 @@ def _cases(group: Any) -> None:
     group.add_argument("--seed", metavar="N", type=cli.whole(0, SEEDS), default=0, help="random seed")
     text = "cases at a time, which share the cores out (default: as many as cores, and as need not wait for others)"
     group.add_argument("--workers", metavar="N", type=cli.whole(1, 1024), help=text)
+    group.add_argument("--cluster", **pool.CLUSTER)
 
 
 def _diagnosis(group: Any) -> None:
@@ -100,7 +101,7 @@ def _blind(argv: Sequence[str] | None) -> int:
         args.command, tuple(args.more), not args.no_sandbox, args.drive or "", tuple(args.packages),
     )  # fmt: skip
     seconds = None if args.minutes is None else 60 * args.minutes
-    limits = Limits(args.cases, seconds, args.workers)
+    limits = Limits(args.cases, seconds, args.workers, args.cluster)
     from bayessim_mjx.blind import answer, show
 
     with stages(args.headless) as say:

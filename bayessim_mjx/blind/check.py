@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import os
+import shlex
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -67,6 +69,22 @@ class Check:
         for name in self.effects:
             if name not in KNOWN:
                 raise unknown("--effects:", name, sorted(KNOWN), "docs/effects.md")
+
+    def anywhere(self) -> "Check":
+        """Name every file by its full path, for processes in other folders and on machines that share the disk."""
+
+        def full(path: str) -> str:
+            return os.path.abspath(path) if path else ""  # links stay: that of a venv's python finds its packages
+
+        def there(word: str) -> str:
+            return full(word) if Path(word).is_file() else word
+
+        parts = [part.rpartition("=") for part in self.packages]
+        return dataclasses.replace(
+            self, out=full(self.out), model=full(self.model), data=tuple(map(full, self.data)), map=full(self.map),
+            drive=there(self.drive), packages=tuple(f"{name}{sign}{full(folder)}" for name, sign, folder in parts),
+            command=shlex.join(map(there, shlex.split(self.command))),
+        )  # fmt: skip
 
     @property
     def asked(self) -> tuple[str, ...]:

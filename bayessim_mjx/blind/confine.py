@@ -1,4 +1,7 @@
-"""Start a program that can read no file below a folder: python -I confine.py FOLDER PROGRAM [ARGUMENT ...].
+"""Start a program that can read no file below a folder: python -I confine.py FOLDER ALONE PROGRAM [ARGUMENT ...].
+
+FOLDER: "" hides none. ALONE: if not "", the program can open no TCP connection, where the kernel can refuse it. It ends
+with the process that started it, also where that is killed.
 
 Landlock (Linux 5.13 and newer) keeps a process and all that it starts from reading, and cannot be undone by them. It
 only allows, so everything beside the folder, and beside each folder above it, is allowed. What is new beside them later
@@ -9,6 +12,7 @@ It stands alone: it runs before anything of the library is imported.
 
 import ctypes
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -16,11 +20,12 @@ from pathlib import Path
 CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
 VERSION, PATH_BENEATH = 1, 1  # include/uapi/linux/landlock.h, as those of the next line
 READ_FILE, REFER = 1 << 2, 1 << 13  # REFER: files may move between folders; without it no folder allows that
-NO_NEW_PRIVS = 38  # include/uapi/linux/prctl.h
+CONNECT_TCP = 1 << 1  # of version 4 on, Linux 6.7
+PDEATHSIG, NO_NEW_PRIVS = 1, 38  # include/uapi/linux/prctl.h
 
 
 class _Ruleset(ctypes.Structure):
-    _fields_ = (("handled", ctypes.c_uint64),)
+    _fields_ = (("files", ctypes.c_uint64), ("network", ctypes.c_uint64))
 
 
 class _Beneath(ctypes.Structure):
@@ -57,15 +62,19 @@ def beside(folder: Path) -> list[Path]:
     return [p for inner, outer in zip(above, above[1:], strict=False) for p in outer.iterdir() if p != inner]
 
 
-def hide(folder: Path) -> None:
+def hide(folder: Path, alone: bool = False) -> None:
     """From now on this process, and all that it starts, can read no file below `folder`.
+
+    Args:
+        alone: it can open no TCP connection either, where the system can refuse that.
 
     Raises:
         OSError: the system cannot do it.
     """
     every = READ_FILE | REFER if version() > 1 else READ_FILE
-    ruleset = _Ruleset(every)
-    rules = _call(CREATE_RULESET, ctypes.byref(ruleset), ctypes.sizeof(ruleset), 0)
+    ruleset = _Ruleset(every, CONNECT_TCP if alone else 0)
+    known = ctypes.sizeof(ruleset) if version() >= 4 else ctypes.sizeof(ctypes.c_uint64)  # of the fields, in bytes
+    rules = _call(CREATE_RULESET, ctypes.byref(ruleset), known, 0)
     for path in beside(folder.resolve()):
         if path.is_symlink():  # it leads to what has a rule of its own, or to the folder
             continue
@@ -81,8 +90,10 @@ def hide(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    hide(Path(sys.argv[1]))
+    ctypes.CDLL(None).prctl(PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if sys.argv[1]:
+        hide(Path(sys.argv[1]), bool(sys.argv[2]))
     try:
-        os.execvp(sys.argv[2], sys.argv[2:])
+        os.execvp(sys.argv[3], sys.argv[3:])
     except OSError as error:
-        sys.exit(f"{sys.argv[2]}: {error.strerror}")
+        sys.exit(f"{sys.argv[3]}: {error.strerror}")

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -34,20 +35,28 @@ def apart() -> bool:
     return confine.version() > 0
 
 
-def run(words: Sequence[str], folder: Path, output: IO[str], timeout: float, hidden: Path | None = None) -> Ended:
-    """Run a program in a folder.
+def run(
+    words: Sequence[str], folder: Path, output: IO[str], timeout: float, hidden: Path | None = None,
+    remote: bool = False,
+) -> Ended:  # fmt: skip
+    """Run a program in a folder; it ends with this process.
 
     Args:
         words: the program and its arguments; output: takes what it prints; timeout: s, after which it is killed.
         hidden: a folder of which it can read no file, where the system can do that; None: it can read everything.
+        remote: with `hidden`, it can open no TCP connection either (Linux 6.7 and newer): by one, a program reaches
+            the workers of a cluster, which run what they get and read everything.
 
     Raises:
         OSError: there is no such program.
     """
     scratch = folder / "tmp"
     scratch.mkdir(exist_ok=True)
-    if hidden and apart():
-        words = [sys.executable, "-I", confine.__file__, str(hidden.resolve()), *words]
+    if not shutil.which(words[0]):
+        raise FileNotFoundError(words[0])
+    if sys.platform.startswith("linux"):
+        kept = str(hidden.resolve()) if hidden and apart() else ""
+        words = [sys.executable, "-I", confine.__file__, kept, "alone" if remote else "", *words]
     started = time.perf_counter()
     process = subprocess.Popen(
         words, cwd=folder, stdout=output, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,

@@ -1,24 +1,24 @@
-"""A process that makes cases and has them diagnosed, one after the other, as it reads them from its input.
+"""Makes a case and has it diagnosed, in any process: `pool` calls `work`.
 
 Every diagnosis is a process of its own, in a folder that holds nothing but the logs of its case.
 """
 
 import dataclasses
 import json
-import os
+import platform
 import shlex
 import shutil
-import signal
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import Any
 
 from bayessim_mjx import atomic, cli, trust
 from bayessim_mjx.blind.cases import ITEM, Item, again, make
-from bayessim_mjx.blind.check import Check, bench, loader
-from bayessim_mjx.blind.process import STOPPED, run
+from bayessim_mjx.blind.check import SETTINGS, Check, bench, loader
+from bayessim_mjx.blind.process import STOPPED, apart, run
 from bayessim_mjx.blind.reality.menu import KNOWN
 from bayessim_mjx.blind.reality.plant import Plant
 from bayessim_mjx.blind.reality.twin import base_of, closed, twins
@@ -28,36 +28,47 @@ from bayessim_mjx.outside_tasks import is_file
 TIMEOUT = 3600.0  # s per diagnosis, against one that hangs
 KEPT = ("diagnosis.json", "answer.json")
 EXIT = "exit.json"
+_BENCH = threading.Lock()  # of the bench's plants, where a worker of a cluster has several threads
+_lasted = 0.0  # s that the last case of this process took
+
+
+@dataclasses.dataclass(frozen=True)
+class Terms:
+    """What holds for every case, whichever machine makes it.
+
+    end: s since the epoch; no case is begun that is likely to last longer. None: no limit.
+    apart: truths are to be kept from a diagnosis; remote: it may run on a cluster.
+    """
+
+    end: float | None = None
+    apart: bool = False
+    remote: bool = False
 
 
 def command(check: Check, data: Path, out: Path) -> list[str]:
-    """Build the command of an entry (only `{model}`, `{data}` and `{out}` are replaced), or ours without one."""
-    model = str(Path(check.model).resolve()) if check.model else str(data.parent / "model.xml")
+    """Build the command of an entry (only `{model}`, `{data}` and `{out}` are replaced), or ours without one.
+
+    It runs in another folder: `check` names its files by full paths (`Check.anywhere`).
+    """
+    model = check.model or str(data.parent / "model.xml")
     if check.command:
         words = shlex.split(check.command)
         for name, path in (("{model}", model), ("{data}", str(data)), ("{out}", str(out))):
             words = [w.replace(name, path) for w in words]
-        return [str(Path(w).resolve()) if Path(w).is_file() else w for w in words]  # it runs in another folder
-    robot = ["--task", check.task] if check.task else ["--model", model, *_of_urdf(check)]
+        return words
+    urdf = cli.urdf_words(check.drive, check.packages)
+    robot = ["--task", check.task] if check.task else ["--model", model, *urdf]
     accuracy = ["--accuracy", f"{100 * check.accuracy:g}%"]
     own = [sys.executable, "-m", "bayessim_mjx.diagnose", *robot, "--data", str(data), "--out", str(out)]
     named = ["--effects", ",".join(("all", *check.asked))] if check.asked else []
     return [*own, *accuracy, "--seed", "0", "--headless", "--verdict_only", *named, *check.more]
 
 
-def _of_urdf(check: Check) -> list[str]:
-    """Return the flags of a URDF, with full paths: a diagnosis runs in another folder."""
-    parts = [part.rpartition("=") for part in check.packages]
-    packages = [f"{name}{sign}{Path(folder).resolve()}" for name, sign, folder in parts]
-    drive = str(Path(check.drive).resolve()) if Path(check.drive).is_file() else check.drive
-    return cli.urdf_words(drive, packages)
-
-
-def diagnose(check: Check, index: int) -> str:
-    """Diagnose the logs of a case; what came of it, in one line."""
+def diagnose(check: Check, index: int, terms: Terms) -> None:
+    """Diagnose the logs of a case."""
     answer = check.answer(index)
     if (answer / EXIT).exists():
-        return "was there"
+        return
     answer.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="blind_") as folder:
         work = Path(folder)
@@ -68,16 +79,16 @@ def diagnose(check: Check, index: int) -> str:
         if not shutil.which(words[0]):
             raise UserError(f"--command {words[0]}: there is no such program")
         with (answer / "output.txt").open("w") as text:
-            ended = run(words, work, text, TIMEOUT, check.sealed if check.sandbox else None)
+            ended = run(words, work, text, TIMEOUT, check.sealed if check.sandbox else None, terms.remote)
         for name in KEPT:
             if (out / name).exists():
                 shutil.copy(out / name, answer / name)
     if ended.code in STOPPED:
         raise KeyboardInterrupt
     report: dict[str, Any] = dataclasses.asdict(ended) | {"seal": check.seal(index).read_text()}
-    report["closed"] = really_closed(check, index) if ended.code == 0 else None
+    with _BENCH:
+        report["closed"] = really_closed(check, index) if ended.code == 0 else None
     atomic.write_text(answer / EXIT, json.dumps(report))
-    return f"exit {ended.code}"
 
 
 def really_closed(check: Check, index: int) -> float | None:
@@ -99,39 +110,34 @@ def really_closed(check: Check, index: int) -> float | None:
     return closed(own.ruler, Plant(rig, truth["base"], hidden), Plant(rig, base, causes))
 
 
-def work(check: Check, item: Item) -> dict[str, Any]:
-    """{"index", "told", "seconds"}, or {"error"} for what the user can mend."""
+def work(check: Check, terms: Terms, item: Item) -> int | None:
+    """Make a case and diagnose it; its index, or None if there is no time for it.
+
+    Raises:
+        UserError: what the user can mend.
+        KeyboardInterrupt: somebody stopped the diagnosis; the case is to be run again.
+    """
+    global _lasted
+    if terms.end is not None and time.time() + _lasted >= terms.end:
+        return None
+    _can_run(check, terms)
     started = time.perf_counter()
-    try:
+    with _BENCH:
         make(check, bench(check), item)
-        report = diagnose(check, item.index)
-    except UserError as error:
-        return {"error": str(error)}
-    return {"index": item.index, "told": report, "seconds": time.perf_counter() - started}
+    diagnose(check, item.index, terms)
+    _lasted = time.perf_counter() - started
+    return item.index
 
 
-def main() -> int:
-    """First line: the check; then one item a line, answered by a line each."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the diagnosis ends with its worker
-    first = json.loads(sys.stdin.readline())
-    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in first.items()}
-    check, answers = Check(**given), os.fdopen(os.dup(1), "w")
-    if is_file(check.task):  # the user named it to the command that started this process
+def _can_run(check: Check, terms: Terms) -> None:
+    """Refuse a machine that lacks the check's files, or what keeps the truths from a diagnosis."""
+    here = platform.node()
+    if not (check.folder / SETTINGS).exists():
+        raise UserError(
+            f"{check.folder} is not there on {here}; allowed: an --out, model and logs that all workers share"
+        )
+    if check.sandbox and terms.apart and not apart():
+        ways = "give workers with Linux 5.13 or newer, or --no_sandbox"
+        raise UserError(f"{here} has no Landlock, so a diagnosis there could read the truths; {ways}")
+    if is_file(check.task):  # the user named it to the command that began this call
         trust.allow([check.task.rpartition(":")[0]])
-    os.dup2(2, 1)  # whatever prints must not answer
-    for line in sys.stdin:
-        try:
-            answer = work(check, Item(**json.loads(line)))
-        except KeyboardInterrupt:
-            return 130
-        print(json.dumps(answer), file=answers, flush=True)
-    return 0
-
-
-def asked(check: Check) -> str:
-    """Write the first line for a worker."""
-    return json.dumps(dataclasses.asdict(check))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -98,8 +98,9 @@ class Physics:
         if int(mj_model.opt.integrator) not in (EULER, RK4, IMPLICITFAST):
             raise UserError(f"integrator {mj_model.opt.integrator}: MJX has Euler, RK4 and implicitfast")
         self.max_qvel = None if max_qvel is None else np.broadcast_to(np.asarray(max_qvel, np.float32), (mj_model.nv,))
-        self.model = mjx.put_model(mj_model, impl="jax")
-        self.template = mjx.make_data(mj_model, impl="jax")
+        here = jax.local_devices()[0]  # MJX would take the first of all, which may be another process's
+        self.model = mjx.put_model(mj_model, here, "jax")
+        self.template = mjx.make_data(mj_model, here, "jax")
         self.warp = Warp(mj_model, self.template, self.effects) if impl == "warp" else None
         timestep = float(mj_model.opt.timestep)
         for effect in filter(contract.brought, self.effects):

@@ -1,6 +1,6 @@
 """Whether the strengths that a blind check tells hold: its plan and its estimator on detection curves that are known.
 
-    python benchmarks/blind/calibration.py --checks 200 [--only step,lapses] [--workers 1]
+    python benchmarks/blind/calibration.py --checks 200 [--only step,lapses] [--workers 1] [--cluster WHERE]
 
 Every check draws the truth of a setting (thresholds of effects and places, slopes, lapses), plans its strengths round
 by round as `bayessim-mjx blind` does, and finds or misses each hidden effect by the truth's chance. Counted are the
@@ -14,11 +14,11 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 from scipy.optimize import brentq
 
+from bayessim_mjx import pool
 from bayessim_mjx.blind.cases import known, plan, rounds
 from bayessim_mjx.blind.curves import WANTED, Curves, Group, Trial
 
@@ -153,16 +153,17 @@ def main() -> None:
     parser.add_argument("--checks", type=int, default=200, help="of each setting")
     parser.add_argument("--only", default="", help="settings that begin with one of these words, separated by commas")
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--workers", type=int, help="checks at a time (default: as many as cores)")
+    parser.add_argument("--cluster", **pool.CLUSTER)
     args = parser.parse_args()
     words = tuple(args.only.split(",")) if args.only else ("",)
     print("| true curves | 90 % intervals hold | high over low | median error | told over true | found at the told strength | checks, thresholds |")  # fmt: skip # noqa: E501
     print("|---|---|---|---|---|---|---|", flush=True)
-    with ProcessPoolExecutor(args.workers) as pool:
+    with pool.executor(args.cluster, args.workers) as calls:
         for name in (n for n in SETTINGS if n.startswith(words)):
             started = time.process_time()
             seeds = range(args.first, args.first + args.checks)
-            print(row(name, list(pool.map(judged, [name] * args.checks, seeds, chunksize=8))), flush=True)
+            print(row(name, list(calls.map(judged, [name] * args.checks, seeds))), flush=True)
             print(f"{name}: {time.process_time() - started:.0f} s", file=sys.stderr)
 
 

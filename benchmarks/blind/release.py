@@ -8,7 +8,6 @@ Writes leaderboard.json (commit, seeds, versions, figures) beside this file and 
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +16,7 @@ from kinds import KINDS, VERSION
 from suite import COUNTED, ENTRIES, enter, generate, table, unfinished
 from systems import SYSTEMS
 
+from bayessim_mjx import pool
 from bayessim_mjx.versions import versions
 
 HERE = Path(__file__).resolve().parent
@@ -64,7 +64,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of cases and answers; goes on where it stopped")
     parser.add_argument("--seeds", required=True, help="first:last, last not included")
     parser.add_argument("--systems", default="pendulum,two_link", help=f"of {', '.join(SYSTEMS)}")
-    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    parser.add_argument("--workers", type=int, help="cases at a time (default: as many as cores)")
+    parser.add_argument("--cluster", **pool.CLUSTER)
     args = parser.parse_args()
     first, last = (int(n) for n in args.seeds.split(":"))
     counted = json.loads(RECORD.read_text()) if RECORD.exists() else []
@@ -73,7 +74,7 @@ def main() -> None:
     systems = args.systems.split(",")
     generate(args.out, range(first, last), systems, list(KINDS))
     for name, command in ENTRIES.items():
-        enter(args.out, name, command, args.workers, 3600.0)
+        enter(args.out, name, command, args.workers, 3600.0, args.cluster)
     if left := sum(len(unfinished(args.out, name)) for name in ENTRIES):
         sys.exit(f"{left} answers are missing, as they were stopped: start it again")
     text, figures = table(args.out)

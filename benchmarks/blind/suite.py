@@ -10,13 +10,12 @@ An entry gets one case at a time, in a folder with model.xml and logs/ alone, an
 
 import argparse
 import json
-import os
 import shlex
 import shutil
 import sys
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -26,7 +25,7 @@ import numpy as np  # noqa: E402
 from kinds import KINDS, VERSION, make  # noqa: E402
 from systems import SYSTEMS  # noqa: E402
 
-from bayessim_mjx import atomic  # noqa: E402
+from bayessim_mjx import atomic, pool  # noqa: E402
 from bayessim_mjx.blind import process, seal  # noqa: E402
 from bayessim_mjx.blind.outcome import Outcome, alarm, covered, label, rate  # noqa: E402
 from bayessim_mjx.blind.worker import EXIT  # noqa: E402
@@ -64,15 +63,16 @@ def cases(suite: Path) -> list[Path]:
     return sorted(p.parent for p in suite.glob("cases/*/seal.txt"))
 
 
-def enter(suite: Path, name: str, command: str, workers: int, timeout: float) -> None:
+def enter(suite: Path, name: str, command: str, workers: int | None, timeout: float, cluster: str = "") -> None:
     """Have every case diagnosed that this entry has not finished."""
-    todo = unfinished(suite, name)
-    with ThreadPoolExecutor(workers) as pool:
-        for line in pool.map(lambda case: _one(suite, case, name, command, timeout), todo):
+    suite = suite.resolve()  # for processes in other folders
+    one = partial(_one, suite, name=name, command=command, timeout=timeout, remote=bool(cluster))
+    with pool.executor(cluster, workers) as calls:
+        for line in calls.map(one, unfinished(suite, name)):
             print(line, flush=True)
 
 
-def _one(suite: Path, case: Path, name: str, command: str, timeout: float) -> str:
+def _one(suite: Path, case: Path, name: str, command: str, timeout: float, remote: bool) -> str:
     answer = _made(suite / "entries" / name / case.name)
     with tempfile.TemporaryDirectory(prefix="blind_") as folder:
         work = Path(folder)
@@ -80,7 +80,7 @@ def _one(suite: Path, case: Path, name: str, command: str, timeout: float) -> st
         where = {"model": work / "model.xml", "data": work / "logs", "out": work / "out"}
         words = [w.format(python=sys.executable, here=HERE.resolve(), **where) for w in shlex.split(command)]
         with (answer / "output.txt").open("w") as text:
-            ended = process.run(words, work, text, timeout, suite / "sealed")
+            ended = process.run(words, work, text, timeout, suite / "sealed", remote)
         if (said := work / "out" / "diagnosis.json").exists():
             shutil.copy(said, answer / "diagnosis.json")
     if ended.code in process.STOPPED:
@@ -172,7 +172,8 @@ def main() -> None:
     run.add_argument("--entry", nargs="*", default=[], help=f"of {', '.join(ENTRIES)}")
     run.add_argument("--name", help="of an entry of your own")
     run.add_argument("--command", help="its command, with {model}, {data} and {out}")
-    run.add_argument("--workers", type=int, default=os.cpu_count())
+    run.add_argument("--workers", type=int, help="cases at a time (default: as many as cores)")
+    run.add_argument("--cluster", **pool.CLUSTER)
     run.add_argument("--timeout", type=float, default=3600.0, help="s per case")
     told = commands.add_parser("leaderboard", help="open the seals and score all entries")
     told.add_argument("suite", type=Path)
@@ -182,7 +183,7 @@ def main() -> None:
     elif args.does == "enter":
         chosen = {n: ENTRIES[n] for n in args.entry} | ({args.name: args.command} if args.name else {})
         for name, command in chosen.items():
-            enter(args.suite, name, command, args.workers, args.timeout)
+            enter(args.suite, name, command, args.workers, args.timeout, args.cluster)
     else:
         print(table(args.suite)[0])
 

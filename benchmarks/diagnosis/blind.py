@@ -12,14 +12,11 @@ of 2000 and more, which nothing was tuned on.
 
 import argparse
 import json
-import multiprocessing
 import os
-import queue
 import signal
-import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from pathlib import Path
 
 from cases import KNOWN, STRENGTHS, SYSTEMS, make_case
@@ -28,7 +25,10 @@ from isolable import KINDS, looked_at, seed_of
 from tables import score
 from turns import Job, jobs
 
-WORKER = Path(__file__).with_name("worker.py")
+from bayessim_mjx import pool
+from bayessim_mjx.blind.process import LATE
+
+WORKER = Path(__file__).resolve().with_name("worker.py")
 STOPPED = (130, -signal.SIGINT, -signal.SIGTERM)  # by somebody: to be run again
 
 
@@ -49,8 +49,8 @@ def generate(args: argparse.Namespace) -> None:
     seeds = range(first, *(rest or [first + 1]))
     todo = jobs(args.out, seeds, args.kinds.split(","), args.systems.split(","), args.strengths.split(","))
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one core per case is faster than all cores per case
-    with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
-        for line in pool.imap(_make, todo):
+    with pool.executor(args.cluster, args.workers) as calls:
+        for line in calls.map(_make, todo):
             print(line, flush=True)
 
 
@@ -58,17 +58,10 @@ def diagnose(args: argparse.Namespace) -> None:
     """Every case that is not finished, each in a process on a core of its own; finished cases stay."""
     where = "left_out" if args.leave_out_family else "diagnosis"
     todo = [folder for folder in cases(args.cases) if _wanted(folder, where, args)]
-    cores: queue.Queue[int] = queue.Queue()
-    usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-    for core in usable[: args.workers]:
-        cores.put(core)
-    with ThreadPoolExecutor(min(args.workers, len(usable))) as pool:
-        running = [pool.submit(_diagnose_one, folder, where, args, cores) for folder in todo]
-        try:
-            for done, each in enumerate(as_completed(running), 1):
-                print(f"{done}/{len(todo)} {each.result()}", flush=True)
-        finally:  # Ctrl-C: what has not begun does not begin
-            pool.shutdown(cancel_futures=True)
+    with pool.executor(args.cluster, args.workers, share=False) as calls:
+        running = [calls.submit(_diagnose_one, folder, where, args) for folder in todo]
+        for done, each in enumerate(as_completed(running), 1):
+            print(f"{done}/{len(todo)} {each.result()}", flush=True)
 
 
 def _wanted(folder: Path, where: str, args: argparse.Namespace) -> bool:
@@ -80,12 +73,12 @@ def _wanted(folder: Path, where: str, args: argparse.Namespace) -> bool:
     return not ended or (args.baselines and not (folder / where / "baselines.json").exists())
 
 
-def _diagnose_one(folder: Path, where: str, args: argparse.Namespace, cores: "queue.Queue[int]") -> str:
-    out, core = folder / where, cores.get()
+def _diagnose_one(folder: Path, where: str, args: argparse.Namespace) -> str:
+    out = folder / where
     out.mkdir(exist_ok=True)
     for old in ("exit.json", "baselines.json"):
         (out / old).unlink(missing_ok=True)
-    command = [sys.executable, WORKER, folder, "--out", out, "--core", core]
+    command = [sys.executable, WORKER, folder, "--out", out]
     command += ["--baselines"] if args.baselines and not args.leave_out_family else []
     command += ["--verdict-only"] if args.verdict_only else []
     more = list(args.more)
@@ -94,17 +87,9 @@ def _diagnose_one(folder: Path, where: str, args: argparse.Namespace, cores: "qu
         more += ["--effects", without((e["name"] for e in hidden), KNOWN)]
     quiet = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
     started = time.perf_counter()
-    try:
-        with (out / "output.txt").open("w") as text:
-            done = subprocess.run(
-                [str(c) for c in [*command, "--more", *more]],
-                stdout=text, stderr=subprocess.STDOUT, timeout=args.timeout, env=os.environ | quiet,
-            )  # fmt: skip
-        code = done.returncode
-    except subprocess.TimeoutExpired:
-        code = 124
-    finally:
-        cores.put(core)
+    words = [str(c) for c in [*command, "--more", *more]]
+    code = pool.alone(words, out / "output.txt", time.time() + args.timeout, quiet)
+    code = LATE if code == -signal.SIGKILL else code
     seconds = time.perf_counter() - started
     if not (out / "exit.json").exists() and code not in STOPPED:  # died: counts as a case without a result
         (out / "exit.json").write_text(json.dumps({"code": code, "seconds": seconds}))
@@ -126,14 +111,14 @@ def isolate(args: argparse.Namespace) -> None:
     kinds = {f: json.loads((f / "truth.json").read_text())["kind"] for f in cases(args.cases)}
     todo = [f for f, kind in kinds.items() if kind in args.kinds.split(",") and not (f / "isolable.json").exists()]
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
-        for line in pool.imap_unordered(_isolate, todo):
-            print(line, flush=True)
+    with pool.executor(args.cluster, args.workers) as calls:
+        for each in as_completed([calls.submit(_isolate, folder) for folder in todo]):
+            print(each.result(), flush=True)
 
 
 def cases(folder: Path) -> list[Path]:
     """By seed, then by name: whenever it is stopped, all systems and kinds have been tried equally often."""
-    found = (p.parent for p in folder.glob("*/truth.json"))
+    found = (p.parent for p in folder.resolve().glob("*/truth.json"))
     return sorted(found, key=lambda f: (f.name.rpartition("_s")[2].zfill(9), f.name))
 
 
@@ -146,7 +131,8 @@ def main() -> None:
     new.add_argument("--kinds", default=",".join(KINDS))
     new.add_argument("--systems", default=",".join(SYSTEMS))
     new.add_argument("--strengths", default="medium,strong", help=f"of {', '.join(STRENGTHS)}; they take turns")
-    new.add_argument("--workers", type=int, default=os.cpu_count())
+    new.add_argument("--workers", type=int, help="cases at a time (default: as many as cores)")
+    new.add_argument("--cluster", **pool.CLUSTER)
     new.set_defaults(does=generate)
     old = commands.add_parser("run", help="diagnose every case that has no result yet")
     old.add_argument("cases", type=Path)
@@ -156,14 +142,16 @@ def main() -> None:
     )  # fmt: skip
     old.add_argument("--baselines", action="store_true", help="and the baselines on the same fits")
     old.add_argument("--verdict-only", action="store_true", help="no maps, next experiment and report: faster")
-    old.add_argument("--workers", type=int, default=os.cpu_count(), help="cases at a time, one core each")
+    old.add_argument("--workers", type=int, help="cases at a time, one core each (default: as many as cores)")
+    old.add_argument("--cluster", **pool.CLUSTER)
     old.add_argument("--timeout", type=float, default=3600.0, help="s per case")
     old.add_argument("--more", nargs=argparse.REMAINDER, default=[], help="further arguments of the command; last")
     old.set_defaults(does=diagnose)
     apart = commands.add_parser("isolable", help="which effects other causes explain as well, from the truth alone")
     apart.add_argument("cases", type=Path)
     apart.add_argument("--kinds", default="single", help="single, double or both; of two effects each as if alone")
-    apart.add_argument("--workers", type=int, default=os.cpu_count())
+    apart.add_argument("--workers", type=int, help="cases at a time (default: as many as cores)")
+    apart.add_argument("--cluster", **pool.CLUSTER)
     apart.set_defaults(does=isolate)
     told = commands.add_parser("score", help="rates with 95 %% Wilson intervals beside the baselines, confusion matrix")
     told.add_argument("cases", type=Path)

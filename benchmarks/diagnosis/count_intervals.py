@@ -1,7 +1,7 @@
 """Do 90 % intervals hold where a data sheet is less accurate than assumed, and on few or poor logs?
 
-    python benchmarks/diagnosis/count_intervals.py run OUT --jobs 64 --minutes 9 [--only sheets] [--shard 0/2]
-    python benchmarks/diagnosis/count_intervals.py isolable OUT --jobs 64 --minutes 9   # needs no result
+    python benchmarks/diagnosis/count_intervals.py run OUT --workers 64 --minutes 9 [--only sheets] [--shard 0/2]
+    python benchmarks/diagnosis/count_intervals.py isolable OUT --workers 64 --minutes 9   # needs no result
     python benchmarks/diagnosis/count_intervals.py isolable OUT --case pendulum_single_s9300
     python benchmarks/diagnosis/count_intervals.py score OUT [--before OTHER]
 
@@ -9,8 +9,8 @@
 other realities. Rules, fixed before any case was diagnosed:
 
 - **Command.** `diagnose --model --data --seed 0 --verdict_only`: nothing is said of the data sheet's accuracy, all
-  effects are on offer, no time limit of the search. Another commit is measured with PYTHONPATH set to its checkout,
-  another rule with `--more`.
+  effects are on offer, no time limit of the search. Another commit (that has `bayessim_mjx.pool`) is measured with
+  PYTHONPATH set to its checkout, another rule with `--more`.
 - **Running.** A process on one core for each case; it makes the case, diagnoses it and writes OUT/CASE/result.json.
   Those that are likely to take longest begin first. When the minutes are over, running ones are killed. A case without
   result counts as unfinished. The next `run` begins it again; its logs and the fits of its search stay.
@@ -46,13 +46,15 @@ import dataclasses
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 import traceback
 from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
 from typing import Any
+
+from bayessim_mjx import pool
 
 RESULT, PLAN, RIVALS = "result.json", "plan.json", "isolable.json"
 # CPU seconds of one single with an empty compilation cache (machine C; the servo arm's was not ended), for the order
@@ -124,65 +126,49 @@ def _write(path: Path, content: Any) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """All cases without a result, longest first, until the minutes are over."""
-    waiting = _waiting(args)
-    # of one case, somebody else shares the cores among such commands
-    free = [None] if args.case else usable(args.jobs)
-    print(f"{len(waiting)} cases, {len(free)} at once, {args.minutes:g} minutes", flush=True)
-    side_by_side(
-        waiting, free, args.minutes, lambda folder, core: _begin(folder, core, args), lambda f: _line(f, args.does)
-    )
+    waiting, end = _waiting(args), time.time() + 60 * args.minutes
+    print(f"{len(waiting)} cases, {args.minutes:g} minutes", flush=True)
+    with pool.executor(args.cluster, args.workers, share=False) as calls:
 
+        def begin(folder: Path) -> Future[int | None]:
+            output = folder / ("output.txt" if args.does == "run" else "rivals.txt")
+            # of one case, somebody else shares the cores among such commands
+            return calls.submit(pool.alone, _words(folder, args), output, end, variables(args.platforms), not args.case)
 
-def usable(count: int) -> list[int | None]:
-    """At most so many cores of this process."""
-    own = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-    return [*own[:count]]
+        side_by_side(waiting, begin, lambda f: _line(f, args.does))
 
 
 def side_by_side(
     waiting: list[Path],
-    free: list[int | None],
-    minutes: float,
-    begin: Callable[[Path, int | None], "subprocess.Popen[bytes]"],
+    begin: Callable[[Path], Future[int | None]],
     line: Callable[[Path], str],
     ready: Callable[[Path], bool] = lambda folder: True,
 ) -> None:
-    """A process for each folder, one on each free core, until the minutes are over; then running ones are killed.
+    """A command for each folder, as `pool.alone` ends it when the time is over.
 
     Args:
         line: what is printed when one has ended; ready: whether one may begin. It ends if none may and none runs.
     """
-    running, until = dict[int | None, tuple[Any, Path, float]](), time.monotonic() + 60 * minutes
+    running, killed, late = dict[Future[int | None], Path](), 0, 0
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that processes end with it
-    try:
-        while time.monotonic() < until:
-            now = [f for f in waiting if ready(f)]
-            if not running and not now:
-                break
-            while now and free:
-                core, folder = free.pop(), now.pop(0)
-                waiting.remove(folder)
-                running[core] = (begin(folder, core), folder, time.monotonic())
-            for core, (process, folder, begun) in list(running.items()):
-                if process.poll() is not None:
-                    del running[core]
-                    free.append(core)
-                    print(f"{time.monotonic() - begun:4.0f} s {line(folder)}", flush=True)
-            time.sleep(0.2)
-    finally:
-        for process, _, _ in running.values():
-            os.killpg(process.pid, signal.SIGKILL)
-    print(f"{len(running)} killed, {len(waiting)} not begun" if running or waiting else "all ended")
+    while True:
+        for folder in [f for f in waiting if ready(f)]:
+            waiting.remove(folder)
+            running[begin(folder)] = folder
+        if not running:
+            break
+        for future in wait(running, return_when=FIRST_COMPLETED)[0]:
+            folder, code = running.pop(future), future.result()
+            killed, late = killed + (code == -signal.SIGKILL), late + (code is None)
+            if code not in (None, -signal.SIGKILL):
+                print(line(folder), flush=True)
+    print(f"{killed} killed, {late + len(waiting)} not begun" if killed or late or waiting else "all ended")
 
 
-def alone(command: list[str], output: Path, platforms: str = "cpu") -> "subprocess.Popen[bytes]":
-    """A process of one thread in a session of its own, which writes its output to a file."""
+def variables(platforms: str = "cpu") -> dict[str, str]:
+    """Environment variables of a process of one thread."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} {ALONE}".strip()
-    own = {"JAX_PLATFORMS": platforms, "XLA_FLAGS": flags, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | THREADS
-    with output.open("w") as text:
-        return subprocess.Popen(
-            command, stdout=text, stderr=subprocess.STDOUT, env=os.environ | own, start_new_session=True
-        )
+    return {"JAX_PLATFORMS": platforms, "XLA_FLAGS": flags, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | THREADS
 
 
 def _waiting(args: argparse.Namespace) -> list[Path]:
@@ -197,17 +183,15 @@ def _waiting(args: argparse.Namespace) -> list[Path]:
     chosen = sorted(chosen, key=lambda p: (-SECONDS[p.system] * max(len(p.effects), 1), p.seed, p.name))[index::count]
     folders = []
     for plan in chosen:
-        folder = args.out / plan.name
+        folder = args.out.resolve() / plan.name
         folder.mkdir(parents=True, exist_ok=True)
         (folder / PLAN).write_text(json.dumps(dataclasses.asdict(plan)))
         folders += [] if (folder / DONE[args.does]).exists() else [folder]
     return folders
 
 
-def _begin(folder: Path, core: int | None, args: argparse.Namespace) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, __file__, ONE[args.does], str(folder), f"--more={args.more}"]
-    command += [] if core is None else ["--core", str(core)]
-    return alone(command, folder / ("output.txt" if args.does == "run" else "rivals.txt"), args.platforms)
+def _words(folder: Path, args: argparse.Namespace) -> list[str]:
+    return [sys.executable, str(Path(__file__).resolve()), ONE[args.does], str(folder.resolve()), f"--more={args.more}"]
 
 
 def _line(folder: Path, does: str) -> str:
@@ -231,7 +215,8 @@ def _parser() -> argparse.ArgumentParser:
     for name, text in (("run", "cases without a result"), ("isolable", "rivals of the hidden effects, by the truth")):
         several = commands.add_parser(name, help=text)
         several.add_argument("out", type=Path)
-        several.add_argument("--jobs", type=int, default=os.cpu_count(), help="cases at once, one core each")
+        several.add_argument("--workers", type=int, help="cases at once, one core each (default: as many as cores)")
+        several.add_argument("--cluster", **pool.CLUSTER)
         several.add_argument("--minutes", type=float, default=1e6, help="when they are over, running cases are killed")
         several.add_argument("--only", choices=("all", "sheets", "logs", "outside", "frozen"), default="all")
         several.add_argument("--systems", default="", help="some robots, separated by commas; default all")
@@ -243,7 +228,6 @@ def _parser() -> argparse.ArgumentParser:
     for name in ONE.values():
         single = commands.add_parser(name, help="one case in this process")
         single.add_argument("folder", type=Path)
-        single.add_argument("--core", type=int)
         single.add_argument("--more", default="")
     table = commands.add_parser("score", help="tables of what came of all cases")
     table.add_argument("out", type=Path)
@@ -260,8 +244,6 @@ def main() -> None:
 
         print(tables(args.out, args.before))
     else:
-        if args.core is not None and hasattr(os, "sched_setaffinity"):
-            os.sched_setaffinity(0, {args.core})  # before JAX counts the cores
         one(args.folder, args.more.split()) if args.does == "one" else rivals(args.folder)
 
 

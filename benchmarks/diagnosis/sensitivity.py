@@ -1,7 +1,7 @@
 """Which answers change where a number of the diagnosis is halved or doubled.
 
     python benchmarks/diagnosis/sensitivity.py --cases frozen --numbers all --out benchmarks/records/sensitivity.json
-        [--workers N] [--minutes M] [--folder logs/sensitivity] [--page docs/decisions/numbers.md]
+        [--workers N] [--cluster WHERE] [--minutes M] [--folder logs/sensitivity] [--page docs/decisions/numbers.md]
 
 Numbers are those of `bayessim_mjx.diagnosis.selection.numbers`, as `Priors.least` or `HIDDEN`, or `MODULE:NAME` for one
 of another module of the diagnosis. A number is replaced in the text of its module before anything imports it: what is
@@ -18,7 +18,6 @@ import argparse
 import ast
 import importlib.util
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -28,7 +27,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from count_intervals import PLAN, RESULT, SECONDS, alone, side_by_side, usable
+from count_intervals import PLAN, RESULT, SECONDS, side_by_side, variables
+
+from bayessim_mjx import pool
 
 ROOT = Path(__file__).parents[2]
 PACKAGE, OWN = "bayessim_mjx.diagnosis", "selection.numbers"
@@ -197,18 +198,19 @@ def run_name(number: str, word: str) -> str:
     return f"{number.replace(':', '.')}_{word}"
 
 
-def run(todo: Sequence[Path], workers: int, minutes: float) -> None:
+def run(todo: Sequence[Path], workers: int | None, minutes: float, cluster: str = "") -> None:
     """All runs without a result, one core each, until the minutes are over."""
-    waiting = [f for f in todo if not (f / RESULT).exists()]
-    free = usable(workers)
-    print(f"{len(waiting)} of {len(todo)} runs, {len(free)} at once, {minutes:g} minutes", flush=True)
-    side_by_side(  # those of a case begin when its logs are there
-        waiting, free, minutes, _begin, _line, lambda f: f.name == UNCHANGED or (f.parent / MADE).exists()
-    )
+    waiting, end = [f for f in todo if not (f / RESULT).exists()], time.time() + 60 * minutes
+    print(f"{len(waiting)} of {len(todo)} runs, {minutes:g} minutes", flush=True)
+    with pool.executor(cluster, workers, share=False) as calls:
+        side_by_side(  # those of a case begin when its logs are there
+            waiting, lambda f: calls.submit(pool.alone, _words(f), f / "output.txt", end, variables()), _line,
+            lambda f: f.name == UNCHANGED or (f.parent / MADE).exists(),
+        )  # fmt: skip
 
 
-def _begin(folder: Path, core: int | None) -> "subprocess.Popen[bytes]":
-    return alone([sys.executable, __file__, "--one", str(folder), "--core", str(core)], folder / "output.txt")
+def _words(folder: Path) -> list[str]:
+    return [sys.executable, str(Path(__file__).resolve()), "--one", str(folder)]
 
 
 def _line(folder: Path) -> str:
@@ -307,21 +309,19 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--cases", default="frozen", help="frozen, or names of counted cases, separated by commas")
     parser.add_argument("--numbers", default="all", help="all, or some, separated by commas")
     parser.add_argument("--out", type=Path, help="the record to write")
-    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="runs at once, one core each")
+    parser.add_argument("--workers", type=int, help="runs at once, one core each (default: as many as cores)")
+    parser.add_argument("--cluster", **pool.CLUSTER)
     parser.add_argument("--minutes", type=float, default=1e6, help="when they are over, running ones are killed")
     parser.add_argument("--folder", type=Path, default=ROOT / "logs" / "sensitivity", help="of all runs")
     parser.add_argument("--commit", default="", help="of the record; default: the checkout's")
     parser.add_argument("--page", type=Path, help="page whose table gets the counts")
     parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--core", type=int, help=argparse.SUPPRESS)
     return parser
 
 
 def main() -> None:
     args = _parser().parse_args()
     if args.one is not None:
-        if args.core is not None and hasattr(os, "sched_setaffinity"):
-            os.sched_setaffinity(0, {args.core})  # before JAX counts the cores
         one(args.one)
         return
     from counted_cases import frozen, plans
@@ -331,7 +331,7 @@ def main() -> None:
     if unknown := [n for n in names if n not in known]:
         raise SystemExit(f"no such cases: {', '.join(unknown)}")
     chosen = numbers() if args.numbers == "all" else args.numbers.split(",")
-    run(jobs(args.folder, [known[n] for n in names], chosen), args.workers, args.minutes)
+    run(jobs(args.folder.resolve(), [known[n] for n in names], chosen), args.workers, args.minutes, args.cluster)
     if args.out is not None:
         commit = (
             args.commit

@@ -1,6 +1,6 @@
 """One case of the blind benchmark in a process of its own: the command, the true effect's closure, the baselines.
 
-    python benchmarks/diagnosis/worker.py CASE --out FOLDER [--core N] [--baselines] [--verdict-only] [--more ARGUMENTS]
+    python benchmarks/diagnosis/worker.py CASE --out FOLDER [--baselines] [--verdict-only] [--more ARGUMENTS]
 
 Writes what the command writes, then oracle.json, exit.json (without it the case is not finished), baselines.json. The
 command gets nothing but model and logs; the truth is opened after its verdict is on disk.
@@ -8,7 +8,6 @@ command gets nothing but model and logs; the truth is opened after its verdict i
 
 import argparse
 import json
-import os
 import sys
 import time
 from pathlib import Path
@@ -131,13 +130,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("case", type=Path)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--core", type=int, help="the only CPU to use")
     parser.add_argument("--baselines", action="store_true")
     parser.add_argument("--verdict-only", action="store_true")
     parser.add_argument("--more", nargs=argparse.REMAINDER, default=[], help="arguments of the command; last")
     args = parser.parse_args()
-    if args.core is not None and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {args.core})  # before JAX counts the cores
     if args.verdict_only:
         without_pictures()
     return work(args.case, args.out, args.baselines, args.more)

@@ -3,7 +3,6 @@
 import argparse
 import json
 import os
-import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
@@ -202,19 +201,18 @@ def test_errors_belong_to_the_nearest_scale_by_ratio():
 
 
 def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_path, monkeypatch, capsys):
-    begun: list = []
-
-    def sleep(folder: Path, core: int, args: argparse.Namespace) -> subprocess.Popen:
+    def sleep(folder: Path, args: argparse.Namespace) -> list[str]:
         assert args.more == "--accuracy 5%"
-        begun.append(subprocess.Popen(["sleep", "60"], start_new_session=True))
-        return begun[-1]
+        return ["sh", "-c", "echo begun; exec sleep 60"]
 
-    monkeypatch.setattr(command, "_begin", sleep)
-    given = {"jobs": 1, "minutes": 0.01, "only": "sheets", "systems": "leg", "shard": "1/10", "reality": "mujoco"}
-    args = argparse.Namespace(out=tmp_path, more="--accuracy 5%", does="run", case="", **given)
+    monkeypatch.setattr(command, "_words", sleep)
+    given = {"workers": 1, "minutes": 0.1, "only": "sheets", "systems": "leg", "shard": "1/10", "reality": "mujoco"}
+    args = argparse.Namespace(
+        out=tmp_path, more="--accuracy 5%", does="run", case="", cluster="", platforms="cpu", **given
+    )
     for _ in range(2):
         command.run(args)
-    assert [p.wait(5) for p in begun] == [-9, -9]
+    assert [p.read_text() for p in tmp_path.glob("*/output.txt")] == ["begun\n"]
     assert capsys.readouterr().out.count("1 killed, 1 not begun") == 2
     first = sorted(tmp_path.iterdir())[0]
     (first / "result.json").write_text("{}")
@@ -225,17 +223,16 @@ def test_cases_that_run_when_the_time_is_over_are_killed_and_begun_again(tmp_pat
 def test_one_case_is_examined_by_its_name_without_a_result_and_only_once(plans, tmp_path, monkeypatch, capsys):
     begun: list = []
 
-    def write(folder: Path, core: int | None, args: argparse.Namespace) -> subprocess.Popen:
-        begun.append((folder.name, core))
-        (folder / "isolable.json").write_text("[]")
-        return subprocess.Popen(["true"], start_new_session=True)
+    def write(folder: Path, args: argparse.Namespace) -> list[str]:
+        begun.append(folder.name)
+        return ["sh", "-c", f"echo [] > {folder}/isolable.json"]
 
-    monkeypatch.setattr(command, "_begin", write)
+    monkeypatch.setattr(command, "_words", write)
     name = next(p.name for p in plans if p.reality == "own integrator")
     for _ in range(2):
         monkeypatch.setattr(sys, "argv", ["count_intervals.py", "isolable", str(tmp_path), "--case", name])
         command.main()
-    assert begun == [(name, None)] and "0 cases" in capsys.readouterr().out
+    assert begun == [name] and "0 cases" in capsys.readouterr().out
 
 
 def test_sizes_are_those_of_the_written_case_where_there_is_one(plans, tmp_path, monkeypatch):

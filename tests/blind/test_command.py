@@ -35,6 +35,10 @@ def call(*words: object) -> int:
         (("--model", "m.xml", "--accuracy", "5"), "allowed: per cent"),
         (("--model", "m.xml", "--minutes", "-1"), "allowed: minutes"),
         (("--model", "m.xml", "--cases", "0"), "must be from 1"),
+        (("--model", "m.xml", "--cluster", "mine:1"), "--cluster: 'mine:1': allowed: tcp://HOST:PORT"),
+        (("--model", "m.xml", "--cluster", "tcp://host"), "allowed: tcp://HOST:PORT"),
+        (("--model", "m.xml", "--cluster", "tcp://host:70000"), "allowed: tcp://HOST:PORT"),
+        (("--model", "m.xml", "--cluster", "slurm:no.yaml"), "there is no file no.yaml"),
         (("--task", "Pendulum", "--drive", "torque"), "--drive and --packages are for --model FILE"),
     ],
 )
@@ -60,7 +64,7 @@ def test_a_urdf_has_the_drive_that_the_diagnosis_of_its_cases_gets(tmp_path, mon
     check = Check("out", "r.urdf", drive="drives.yaml", packages=("mine=meshes",))
     model = loader(check)().compile()
     assert (model.actuator(0).name, model.actuator_gainprm[0, 0], model.nmesh) == ("elbow", 40, 1)
-    words = worker.command(check, tmp_path / "logs", tmp_path / "out")
+    words = worker.command(check.anywhere(), tmp_path / "logs", tmp_path / "out")
     assert words[words.index("--drive") + 1] == str(tmp_path / "drives.yaml")  # it runs in another folder
     assert words[words.index("--packages") + 1] == f"mine={tmp_path}/meshes"
 

@@ -1,4 +1,4 @@
-"""Cases that are under way at a time share the cores out."""
+"""Processes of a pool share the cores out."""
 
 import itertools
 import os
@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from bayessim_mjx.blind.cases import AT_ONCE, known, rounds
-from bayessim_mjx.blind.runner import Cores, lent, move, shares
+from bayessim_mjx.pool.cores import Cores, lent, move, shares
 
 
 @pytest.mark.parametrize(("cores", "workers"), [(64, 32), (64, 30), (16, 3), (2, 2)])
@@ -78,7 +78,7 @@ def test_a_process_that_ended_is_no_error() -> None:
 @moves
 def test_who_begins_to_work_gets_its_own_cores_back(monkeypatch: pytest.MonkeyPatch) -> None:
     moved = list[tuple[int, list[int]]]()
-    monkeypatch.setattr("bayessim_mjx.blind.runner.move", lambda process, cores: moved.append((process, list(cores))))
+    monkeypatch.setattr("bayessim_mjx.pool.cores.move", lambda process, cores: moved.append((process, list(cores))))
     cores = Cores([[0, 1], [2, 3]])
     cores.working(0, 70)
     cores.working(1, 71)
@@ -89,7 +89,7 @@ def test_who_begins_to_work_gets_its_own_cores_back(monkeypatch: pytest.MonkeyPa
 
 
 def test_workers_without_cores_of_their_own_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bayessim_mjx.blind.runner.move", lambda process, cores: pytest.fail("moved"))
+    monkeypatch.setattr("bayessim_mjx.pool.cores.move", lambda process, cores: pytest.fail("moved"))
     cores = Cores(shares(range(2), 3))
     cores.working(0, 70)
     assert cores.environment() == {}
