@@ -1,14 +1,16 @@
 """Commands that act before or after their rows: found to a tenth of a millisecond, and nothing where there is none."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
 
 from bayessim_mjx.diagnosis.fitting import scales
-from bayessim_mjx.diagnosis.fitting.command_shift import Shift, estimate
+from bayessim_mjx.diagnosis.fitting.command_shift import Shift, _judged, estimate
 from bayessim_mjx.diagnosis.fitting.integrator_choice import GAINS
+from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic
 from bayessim_mjx.diagnosis.fitting.robot import of_file
 from bayessim_mjx.diagnosis.run import diagnose
 from bayessim_mjx.diagnosis.setup import _measured
@@ -131,6 +133,15 @@ def test_a_shift_is_told_only_if_nothing_else_would_do_as_well():
         assert not Shift(-0.003, **{**SURE, **worse}).certain
     assert Shift(-0.003, **{**SURE, "apart": 1e-3}).likely
     assert not Shift(-0.003, **{**SURE, "explains": 0.14}).likely  # an unknown payload's gap is no hint of a lead
+
+
+@pytest.mark.parametrize(("off", "certain"), [(0.5, True), (2.0, True), (20.0, False)])
+def test_a_lead_beside_a_parameter_that_no_data_sheet_is_off_by_is_not_certain(off, certain):
+    """All of the cost is explained, by a shift of 10 standard deviations and a parameter `off` of its prior's."""
+    cut = SimpleNamespace(group=np.repeat([0, 1], 4), dt=PERIOD)
+    q = Quadratic(np.full(8, 25.0), np.zeros((8, 2)), np.tile(np.diag([1250.0, 1250.0]), (8, 1, 1)))
+    found = _judged(q, np.array([-0.1, 0.3 * off]), np.full(2, 0.3**-2), cut, 200)
+    assert found.certain == certain and found.late == pytest.approx(-0.01)
 
 
 def test_the_sentence_names_size_sign_and_remedy():

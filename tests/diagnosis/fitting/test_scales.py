@@ -52,3 +52,27 @@ def test_a_joint_moves_by_its_own_noise(setting):
     np.testing.assert_array_equal(np.flatnonzero(found.moves), [3, 10])  # roll, and "two" by 200 of its own noises
     np.testing.assert_allclose(found.travel[[3, 10]], [0.2, 0.01], rtol=1e-6)
     assert found.at("joint", "two")["travel"] == pytest.approx(0.01)
+
+
+SERVO = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size=".01" mass=".01"/>
+</body></worldbody><actuator>{drive}</actuator></mujoco>"""
+DRIVES = {  # each exerts 0.6 N m on a joint that stands still at 0.1 rad: (its MJCF, its command)
+    "motor": ('<motor name="m" joint="hinge" gear="3"/>', 0.2),
+    "servo": ('<position name="m" joint="hinge" kp="20" gear="1"/>', 0.13),
+    "servo with a filter": ('<position name="m" joint="hinge" kp="20" timeconst=".02"/>', 0.13),
+    "limited servo": ('<position name="m" joint="hinge" kp="200" forcerange="-.6 .6"/>', 0.13),
+}
+
+
+@pytest.mark.parametrize("name", DRIVES)
+def test_what_a_drive_exerts_on_a_joint_at_rest_is_the_joints_force(name):
+    """Friction holds it there, which the model lacks: its motion needs no force at all."""
+    drive, command = DRIVES[name]
+    model = mujoco.MjModel.from_xml_string(SERVO.format(drive=drive))
+    count, sigma = 101, np.full(1, 1e-4)
+    still, ctrl = np.full((count, 1), 0.1), np.full((count, 1), command)
+    log = Log("log", 0.02 * np.arange(count), ctrl, still, 0 * still, True, Channels.of(model), sigma, sigma)
+    found = scales.measure(model, [log])
+    assert found.force[0] == pytest.approx(0.6)
+    assert found.effort[0] == pytest.approx(0.2 if name == "motor" else 0.6)
+    assert found.at("joint", "hinge")["force"] == pytest.approx(0.6)
