@@ -54,8 +54,8 @@ def test_a_joint_moves_by_its_own_noise(setting):
     assert found.at("joint", "two")["travel"] == pytest.approx(0.01)
 
 
-SERVO = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size=".01" mass=".01"/>
-</body></worldbody><actuator>{drive}</actuator></mujoco>"""
+SERVO = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="hinge" axis="0 1 0"/>
+  <geom size=".01" mass=".01"/></body></worldbody><actuator>{drive}</actuator></mujoco>"""
 DRIVES = {  # each exerts 0.6 N m on a joint that stands still at 0.1 rad: (its MJCF, its command)
     "motor": ('<motor name="m" joint="hinge" gear="3"/>', 0.2),
     "servo": ('<position name="m" joint="hinge" kp="20" gear="1"/>', 0.13),
