@@ -222,7 +222,7 @@ def tried(fault: Fault, root: Path) -> tuple[str, str]:
     elif fault.log_map is not None:
         (folder / "map.yaml").write_text(yaml.safe_dump(dict(fault.log_map)))
     _, checked = _called(["check", str(folder), "--model", str(model)])
-    said += checked
+    said += "\n".join(line for line in checked.splitlines() if line.startswith(("note:", "missing:")))
     try:
         logs, warned = _read(folder, fault)
         said += warned

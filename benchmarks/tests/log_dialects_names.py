@@ -51,8 +51,9 @@ def floating(scale: float = 1.0, upright: bool = False, g: float = 1.0, rate: fl
     z, y = 0.42 + 0.05 * np.sin(2 * t), 0.1 * np.sin(t)
     lift = -0.2 * np.sin(2 * t)
     pose = [0.02 * t, z if upright else y, -y if upright else z]
-    quat = [np.ones(200), *np.zeros((3, 200))]
-    imu = [*np.zeros((2, 200)), rate * 0.01 * np.cos(t), *np.zeros((2, 200)), (9.81 + lift) / g]
+    yaw = 0.5 * np.sin(t)
+    quat = [np.cos(yaw / 2), *np.zeros((2, 200)), np.sin(yaw / 2)]
+    imu = [*np.zeros((2, 200)), rate * 0.5 * np.cos(t), *np.zeros((2, 200)), (9.81 + lift) / g]
     table = np.column_stack([t, np.cos(3 * t), *(scale * np.array(pose)), *quat, 0.4 * np.sin(3 * t), *imu])
     names = ["time", "ctrl:m_knee", *(f"qpos:root[{i}]" for i in range(7)), "qpos:knee",
              *(f"gyro:imu_gyro[{i}]" for i in range(3)), *(f"accel:imu_accel[{i}]" for i in range(3))]  # fmt: skip
@@ -156,5 +157,5 @@ FAULTS = [
     Fault("an accelerometer in g", GRAVITY, floating(g=9.80665), ("9.8", "unit"), "nothing", "float", BASE,
           streams={"accel:imu_accel[2]": 9.81 - 0.2 * np.sin(0.02 * K)}),
     Fault("a gyroscope in degrees per second", GRAVITY, floating(rate=DEG), ("rad/s", "deg/s"), "nothing", "float",
-          BASE, streams={"gyro:imu_gyro[2]": 0.01 * np.cos(0.01 * K)}),
+          BASE, streams={"gyro:imu_gyro[2]": 0.5 * np.cos(0.01 * K)}),
 ]  # fmt: skip

@@ -139,7 +139,7 @@ FAULTS = [
     Fault("ns in seven digits", SCIENCE, stamped(lambda i: f"{1.7726193e18 + 1e7 * i:.6e}"), ("rate",),
           {"time": None, "rate": 100}),
     Fault("rows in bursts of five", BURST, csv(plain(put(S, 0, ODD), "servo")), ("rate",), {"time": {"column": "time",
-          "rate": 100}}, "servo", put(S, 0, ODD)),
+          "rate": 100}}, "servo", S, 0.05),
     Fault("commands and positions in rows of their own", SPARSE, csv(sparse()), ("hold",), None),
     Fault("a long table", TIDY, csv("time,name,value\n" + "".join(f"{row[0]:.6g},{n},{x:.9g}\n" for row in A for n, x in
           zip(LINES[0].split(",")[1:], row[1:], strict=True))), ("one column per channel", "name"), "nothing"),
