@@ -241,9 +241,12 @@ def _known(table: Table, channels: Channels) -> None:
     """Refuse columns of joints that the model lacks: a wrong name, not a joint without an encoder."""
     for stream, allowed in (("qpos", channels.qpos), ("qvel", channels.qvel)):
         for column in table.columns:
-            if column.startswith(f"{stream}:") and column.partition(":")[2] not in allowed:
+            name = column.partition(":")[2]
+            if column.startswith(f"{stream}:") and name not in allowed:
                 names = ", ".join(f"{stream}:{n}" for n in allowed)
-                raise UserError(f"{table.path}: column {column}: the model has no such joint; allowed: {names}")
+                text = f"{table.path}: column {column}: the model has no such joint; allowed: {names}"
+                key = f"`{stream}: {{{name.strip()}: {column!r}}}`"
+                raise UserError(f"{text}; {key} in a map takes it" if name.strip() in allowed else text)
 
 
 def _whole_joints(table: Table, columns: Mapping[str, Array], absent: list[str], channels: Channels) -> None:

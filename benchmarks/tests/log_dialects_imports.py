@@ -232,7 +232,7 @@ FAULTS = [
           .write_text(plain(A))),
     Fault("a packed file", PACKED, {"run.csv.gz": packed()}, (".csv", "gunzip"), lambda folder: (folder / "run.csv")
           .write_text(plain(A))),
-    Fault("a packed file that is called csv", PACKED, {"run.csv": packed()}, ("gunzip", "compressed"), lambda folder:
+    Fault("a packed file that is called csv", PACKED, {"run.csv": packed()}, ("gunzip",), lambda folder:
           (folder / "run.csv").write_text(plain(A))),
     Fault("joints that change places from message to message", ORDER, mcap(swapped), **MCAP),
     Fault("one message without joints", EMPTY, mcap(blank), truth=HELD, **MCAP),

@@ -83,7 +83,7 @@ FAULTS = [
           ("did you mean",), {"time": "Time", "ctrl": {"m_shoulder": "Ctrl:m_shoulder", "m_elbow": "CTRL:m_elbow"},
           "qpos": {"shoulder": "QPos:shoulder", "elbow": "qPos:elbow"}}),
     Fault("blanks behind the colons", CASES, csv(text(A, "time,ctrl: m_shoulder,ctrl: m_elbow,qpos: shoulder,"
-          "qpos: elbow")), ("did you mean",), {"ctrl": {"m_shoulder": "ctrl: m_shoulder", "m_elbow": "ctrl: m_elbow"},
+          "qpos: elbow")), ("did you mean", "in a map takes it"), {"ctrl": {"m_shoulder": "ctrl: m_shoulder", "m_elbow": "ctrl: m_elbow"},
           "qpos": {"shoulder": "qpos: shoulder", "elbow": "qpos: elbow"}}),
     Fault("names of bagpy", BAGPY, csv("\n".join(["Time,name,position_0,position_1,effort_0,effort_1", *(
           f"{t:.6g},\"['shoulder', 'elbow']\",{q1:.9g},{q2:.9g},{u1:.9g},{u2:.9g}" for t, u1, u2, q1, q2 in A)])),

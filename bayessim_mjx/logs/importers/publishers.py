@@ -70,7 +70,7 @@ def of_one_publisher(
         if not 1 <= chosen <= len(ranked):
             raise UserError(f"{name}: --publisher {chosen}; allowed: 1 to {len(ranked)} on {topic}")
         return ranked[chosen - 1][1]
-    why = (not received and _same_stamp(messages)) or _apart(ranked) or _two_tracks(messages)
+    why = (not received and _same_stamp(messages)) or _apart(ranked, received) or _two_tracks(messages, received)
     if not why:
         return list(messages)
     choices = "; ".join(form.sentence(i, len(each)) for i, (form, each) in enumerate(ranked, 1))
@@ -99,29 +99,29 @@ def _same_stamp(messages: Sequence[Message]) -> str:
     return ""
 
 
-def _track(messages: Iterable[Message], joint: str) -> tuple[Array, Array]:
+def _track(messages: Iterable[Message], joint: str, received: bool) -> tuple[Array, Array]:
     """Stamps [s, from the first] and positions of one joint."""
-    pairs = [(m.stamp, p[joint]) for m in messages if joint in (p := _positions(m))]
+    pairs = [(m.received if received else m.stamp, p[joint]) for m in messages if joint in (p := _positions(m))]
     pairs.sort()
     time = np.array([t - pairs[0][0] for t, _ in pairs], float) * 1e-9 + pairs[0][0] % 10**15 * 1e-9
     return time, np.array([x for _, x in pairs])
 
 
-def _apart(ranked: Sequence[tuple[_Form, Sequence[Message]]]) -> str:
+def _apart(ranked: Sequence[tuple[_Form, Sequence[Message]]], received: bool) -> str:
     """Find publishers of other forms whose positions lie off those of the first, interleaved with it."""
     for i, (first, many) in enumerate(ranked):
         for second, few in ranked[i + 1 :]:
             for joint in sorted(set(first.names) & set(second.names)):
-                found = _off(many, few, joint)
+                found = _off(many, few, joint, received)
                 if found:
                     return found
     return ""
 
 
-def _off(many: Sequence[Message], few: Sequence[Message], joint: str) -> str:
+def _off(many: Sequence[Message], few: Sequence[Message], joint: str, received: bool) -> str:
     if not any(joint in _positions(m) for m in many) or not any(joint in _positions(m) for m in few):
         return ""
-    (time, x), (at, y) = _track(many, joint), _track(few, joint)
+    (time, x), (at, y) = _track(many, joint, received), _track(few, joint, received)
     inside = (at > time[0]) & (at < time[-1])
     if len(x) < 3 or not inside.any():
         return ""
@@ -137,10 +137,10 @@ def _off(many: Sequence[Message], few: Sequence[Message], joint: str) -> str:
     return f"between messages with {joint!r} near {between[row]:.6g} others have it at {y[inside][row]:.6g}"
 
 
-def _two_tracks(messages: Sequence[Message]) -> str:
+def _two_tracks(messages: Sequence[Message], received: bool) -> str:
     """Values that leave the motion for one sample and come back, again and again."""
     for joint in _positions(messages[0]) if messages else ():
-        _, x = _track(messages, joint)
+        _, x = _track(messages, joint, received)
         if len(x) < 10:
             continue
         steps = np.abs(np.diff(x))
