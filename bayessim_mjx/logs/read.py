@@ -21,7 +21,9 @@ from bayessim_mjx.logs.inertial import having, onto_encoders
 from bayessim_mjx.logs.log import HOLDS, Array, Channels, Log, suggest
 from bayessim_mjx.logs.mapping import LogMap
 from bayessim_mjx.logs.pieces import MIN_ROWS, pieces
+from bayessim_mjx.logs.plausible import check_plausible
 from bayessim_mjx.logs.proposal import hint
+from bayessim_mjx.logs.sparse import onto_positions
 from bayessim_mjx.logs.table import Table, read_jsonl, read_npz
 from bayessim_mjx.physics import controllers
 
@@ -81,6 +83,7 @@ def _read_one(
     else:
         columns, sources = _columns(table, channels, log_map)
     table, columns = onto_encoders(table, columns, channels)
+    table, columns = onto_positions(table, columns, channels, log_map.hold == "linear")
     columns, absent = filled(table, columns, channels, mj_model) if partial else (columns, ())
     check_names(table, columns, channels)
     table, columns = oldest_first(table, columns)
@@ -104,6 +107,7 @@ def _read_one(
     check_markers(table, columns, sources, channels, log_map)
     check_units(table, columns, channels, mj_model, log_map, through, declared)
     check_motion(table, columns, channels, mj_model, through, absent, declared)
+    check_plausible(table, columns, channels, mj_model, log_map, absent)
     say_better_clock(table, columns, channels, log_map)
     columns = _with_numbers(table, columns)
     if "condition" in metadata:

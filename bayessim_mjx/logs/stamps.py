@@ -118,7 +118,7 @@ def check_digits(raw: Array, table: Table, column: str) -> None:
     seconds = seen // 10000 * 3600 + seen // 100 % 100 * 60 + seen % 100
     steps, plain = np.diff(seconds), np.diff(seen)
     jumps = plain - steps > 1.0  # where the digits of the seconds begin again
-    if jumps.any() and (steps > 0).all() and steps[jumps].max() < 5.0 * float(np.median(steps)):
+    if jumps.any() and (steps > 0).all() and _period(float(np.median(steps))) and steps[jumps].max() < 1.0:
         text = f"{table.path}: column {column!r} reads as hours, minutes and seconds without marks ({seen[0]:.2f})"
         raise UserError(f"{text}; state `time: {{column: {column!r}, format: '%H%M%S.%f'}}` in a map")
 
