@@ -129,9 +129,9 @@ def _by_range(table: Table, name: str, x: Array, kind: str, low: float, high: fl
 
 
 def _many_turns(table: Table, name: str, x: Array) -> None:
-    """More than a turn one way and more than a turn back, of a joint without a range: rare in rad, usual in degrees."""
+    """Two turns one way and two turns back, of a joint without a range: rare in rad, usual in degrees."""
     up, down = np.max(x - np.minimum.accumulate(x)), np.max(np.maximum.accumulate(x) - x)
-    if min(up, down) > TURN and np.ptp(x) > 2.0 * TURN and np.abs(np.diff(x)).max() < np.pi:
+    if min(up, down) > 2.0 * TURN and np.abs(np.diff(x)).max() < np.pi:
         text = f"{table.path}: column {name!r} goes to and fro by {np.ptp(x) / TURN:.3g} turns in rad"
         warnings.warn(f"{text}; degrees would need {_key(name, name, 'deg')} in a map", stacklevel=5)
 

@@ -13,12 +13,13 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import inertial
 from bayessim_mjx.logs.log import Array, Channels
 from bayessim_mjx.logs.mapping import LogMap
-from bayessim_mjx.logs.signals import COUNTS, STEPS, quantum
+from bayessim_mjx.logs.signals import COUNTS, STEPS, noise_level, quantum
 from bayessim_mjx.logs.table import Table
 
 G = 9.80665  # m/s^2, standard gravity: the unit g. Source: CGPM 1901
 DEGREE = np.pi / 180.0
-SUDDEN = 5.0  # times the largest step beside it, from which a step is a jump; benchmarks/records/log_dialects.json
+# times the largest step beside it, from which a step is a jump; benchmarks/records/log_dialects.json
+SUDDEN = 5.0
 FAST, HIGH = 30.0, 100.0  # m/s and m of a robot's base: rules of thumb, a legged robot in mm is beyond one of them
 HALF = 0.5  # share of the rows, and of a unit's size: which of two readings is the nearer one. Source: the middle
 
@@ -68,17 +69,19 @@ def say_jumps(table: Table, columns: Mapping[str, Array], channels: Channels, ab
 
 
 def _sudden(x: Array) -> NDArray[np.bool_]:
-    """Steps [T - 1] of x that are jumps; of a sample that is off both steps."""
+    """Say which steps [T - 1] of x are jumps; of a sample that is off it is both."""
     steps = np.abs(np.diff(x))
     across = np.abs(x[2:] - x[:-2])
-    usual = max(STEPS * float(np.median(across)), COUNTS * quantum(x))
+    usual = max(STEPS * noise_level(x), COUNTS * quantum(x))
     large = np.pad(steps, 2)
     near = np.max([large[0:-4], large[1:-3], large[3:-1], large[4:]], axis=0)
     alone = steps > np.maximum(usual, SUDDEN * near)
     outer = np.max([large[1:-4], large[4:-1]], axis=0)  # beside a pair of steps, away and back
     calm = np.maximum(usual, SUDDEN * np.maximum(outer, across))
     pair = (steps[:-1] > calm) & (steps[1:] > calm)
-    return np.asarray(alone | np.r_[pair, False] | np.r_[False, pair])
+    found = alone | np.r_[pair, False] | np.r_[False, pair]
+    found[:2] = found[-2:] = False  # calm rows on one side alone
+    return np.asarray(found)
 
 
 def check_base(

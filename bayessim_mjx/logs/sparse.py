@@ -36,9 +36,8 @@ def onto_positions(
         return table, columns
     time = columns["time"]
     if not (np.diff(time) >= 0).all():
-        raise UserError(
-            f"{table.path}: each signal has rows of its own, and the stamps run back; allowed: rows in the order of time"
-        )
+        text = f"{table.path}: each signal has rows of its own, and the stamps run back"
+        raise UserError(f"{text}; allowed: rows in the order of time")
     first = next(name for name in needed if name.startswith("qpos:") or not any(n.startswith("qpos:") for n in needed))
     rows = np.flatnonzero(seen[first])
     rows = rows[np.r_[True, np.diff(time[rows]) > 0]]

@@ -94,7 +94,7 @@ FAULTS = [
           u1, u2, q1, q2) in enumerate(A))])), ("`qpos: {", "change"), "nothing"),
     Fault("what ros2 topic echo --csv writes", ECHO, csv("".join(f"{17 + i // 100},{i % 100 * 10_000_000},,shoulder,"
           f"elbow,{q1:.9g},{q2:.9g},{u1:.9g},{u2:.9g}\n" for i, (_, u1, u2, q1, q2) in enumerate(A))),
-          ("header: false",), {"header": False, "time": {"column": 0, "nanoseconds": 1}, "qpos": {"shoulder": 5,
+          ("header: false", "ACTUATOR: COLUMN"), {"header": False, "time": {"column": 0, "nanoseconds": 1}, "qpos": {"shoulder": 5,
           "elbow": 6}, "ctrl": {"m_shoulder": 7, "m_elbow": 8}}),
     in_degrees("shoulderPosDeg"), in_degrees("ShoulderDegrees"), in_degrees("shoulder_deg_filtered"),
     in_degrees("deg_shoulder"), in_degrees("shoulder angle in degrees"), in_degrees("shoulder_pos [deg] (raw)"),
@@ -104,13 +104,13 @@ FAULTS = [
     Fault("timeMs", CAMEL, csv(text(put(A, 0, 0.5 * K), "timeMs,shoulder_torque_cmd,elbow_torque_cmd,shoulder_pos,"
           "elbow_pos")), ("unit: ms",), {"time": {"column": "timeMs", "unit": "ms"}}, truth=put(A, 0, 5e-4 * K)),
     Fault("a temperature in the place of a position", OTHERS, named("shoulder_pos", "elbow_temperature",
-          put(A, 4, 31 + 0.01 * K)), ("elbow",), "nothing"),
+          put(A, 4, 31 + 0.01 * K)), ("elbow",), "nothing", absent=("qpos:elbow",)),
     Fault("a voltage in the place of a command", OTHERS, csv(text(A, "t,shoulder_voltage,elbow_voltage,shoulder_pos,"
           "elbow_pos")), ("ctrl",), {"ctrl": {"m_shoulder": "shoulder_voltage", "m_elbow": "elbow_voltage"}}),
     Fault("temperatures beside positions", OTHERS, named("shoulder_pos", "elbow_pos", A,
           ",shoulder_temp,elbow_temp,elbow_status", (31 + 0 * K, 32 + 0 * K, 0 * K))),
     Fault("an acceleration in the place of a position", OTHERS, named("shoulder_pos", "elbow_acc"), ("elbow",),
-          "nothing"),
+          "nothing", absent=("qpos:elbow",)),
     Fault("desired, actual and error", ERRORS, csv(text(np.c_[S, S[:, 1] - S[:, 3], S[:, 2] - S[:, 4]],
           "t,pan_desired,tilt_desired,pan_actual,tilt_actual,pan_error,tilt_error")), model="servo"),
     Fault("an error in the place of a reading", ERRORS, csv(text(put(put(S, 3, S[:, 1] - S[:, 3]), 4,

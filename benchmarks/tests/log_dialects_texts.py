@@ -140,7 +140,8 @@ FAULTS = [
           {"time": None, "rate": 100}),
     Fault("rows in bursts of five", BURST, csv(plain(put(S, 0, ODD), "servo")), ("rate",), {"time": {"column": "time",
           "rate": 100}}, "servo", S, 0.05),
-    Fault("commands and positions in rows of their own", SPARSE, csv(sparse()), ("hold",), None),
+    Fault("commands and positions in rows of their own", SPARSE, csv(sparse()), ("hold",), None,
+          truth=A[1:], within=2e-3),
     Fault("a long table", TIDY, csv("time,name,value\n" + "".join(f"{row[0]:.6g},{n},{x:.9g}\n" for row in A for n, x in
           zip(LINES[0].split(",")[1:], row[1:], strict=True))), ("one column per channel", "name"), "nothing"),
 ]  # fmt: skip
