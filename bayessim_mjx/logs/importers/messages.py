@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import struct
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.importers.cdr import faster
 from bayessim_mjx.logs.importers.needs import needs
 from bayessim_mjx.logs.importers.streams import Stream
+from bayessim_mjx.logs.log import Array
 
 STATE, IMU, CONTROLLER = "JointState", "Imu", "JointTrajectoryControllerState"
 DYNAMIC, MULTI, LOW_STATE, LOW_COMMAND = "DynamicJointState", "MultiDOFJointState", "LowState", "LowCmd"
@@ -25,7 +29,7 @@ FAR = 1_000_000_000  # ns between stamp and receipt: two clocks; rule of thumb, 
 Kind = Literal["measured", "held", "linear"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Message:
     """One message; `kind` is its type without the package, `received` in ns.
 
@@ -103,6 +107,31 @@ def streams(samples: Mapping[str, Sequence[tuple[float, float]]], kind: Kind) ->
     }
 
 
+def tracks(messages: Sequence[Message], what: str, when: Callable[[Message], float]) -> dict[str, tuple[Array, Array]]:
+    """{joint: (times, finite values)} of one field of joint states, in the order of the messages.
+
+    Args:
+        what: position, velocity or effort. when: time of a message.
+    """
+    groups: dict[tuple[Any, int], list[int]] = defaultdict(list)
+    for i, message in enumerate(messages):
+        groups[tuple(message.body.name), len(getattr(message.body, what))].append(i)
+    time = np.array([when(m) for m in messages], float)
+    found: dict[str, list[tuple[NDArray[np.int64], Array]]] = defaultdict(list)
+    for (names, count), rows in groups.items():
+        table = np.array([getattr(messages[i].body, what) for i in rows], float).reshape(len(rows), count)
+        for joint, values in zip(names, table.T, strict=False):
+            seen = np.isfinite(values)
+            if seen.any():
+                found[str(joint)].append((np.array(rows)[seen], values[seen]))
+    out = {}
+    for joint, pieces in found.items():
+        at, values = (np.concatenate(each) for each in zip(*pieces, strict=True))
+        order = np.argsort(at, kind="stable")
+        out[joint] = time[at[order]], values[order]
+    return out
+
+
 # MCAP files and ROS bags as messages; the packages that read them are imported here and nowhere else
 
 
@@ -127,14 +156,14 @@ def of_mcap(path: Path) -> Iterator[Message]:
             if listed and not topics:  # an empty list would mean all of them
                 return
             decoders: dict[int, Any] = {}
-            for schema, channel, message in reader.iter_messages(topics=topics or None, log_time_order=bool(listed)):
+            for schema, channel, message in reader.iter_messages(topics=topics or None, log_time_order=False):
                 kind, used = _kind(_name(schema), channel.message_encoding)
                 if not used and channel.id not in unread:  # one message says that the topic is not read
                     unread[channel.id] = kind
                     yield Message(channel.topic, kind, 0, None)
                 if used:
                     if channel.id not in decoders:
-                        decoders[channel.id] = decoder.decoder_for(channel.message_encoding, schema)
+                        decoders[channel.id] = faster(_short(kind), decoder.decoder_for("cdr", schema))
                     body = decoders[channel.id](message.data)
                     read += 1
                     sent = int(message.publish_time or message.log_time)
@@ -151,7 +180,7 @@ def of_mcap(path: Path) -> Iterator[Message]:
 def _opened(
     readers: Any, file: Any, errors: tuple[type[Exception], ...]
 ) -> tuple[Any, dict[int, tuple[str, str, bool]]]:
-    """(a reader, {channel: (topic, type, whether it is read)}) of an MCAP file.
+    """Open an MCAP file: (a reader, {channel: (topic, type, whether it is read)}).
 
     Of a file without its end it is a reader from the start, and nothing is listed.
     """
