@@ -34,6 +34,7 @@ _OF_UNIT = {
     **dict.fromkeys((*units.ANGLES, units.COUNTS), "qpos"),
     **dict.fromkeys((*units.FORCES, *units.CURRENTS), "effort"),
 }
+_CURRENTS = frozenset(("current", "iq"))
 _TAKEN = {"qpos": "position", "qvel": "velocity", "effort": "torque or force"}
 
 
@@ -99,6 +100,9 @@ def mismatch(column: str, drive: str, model: mujoco.MjModel) -> str:
     i = Channels.of(model).actuators.index(drive)
     bias = model.actuator_biasprm[i]
     taken = "qpos" if bias[1] < 0 else "qvel" if bias[2] < 0 else "effort"
+    if taken == "effort" == said and unit is None and not words & (KINDS["effort"] - _CURRENTS):
+        entry = f"`ctrl: {{{drive}: {{column: {column!r}, unit: A, torque_constant: NM_PER_A}}}}`"
+        return f"ctrl.{drive}: the model takes a torque or force, and {column} names a current; {entry} converts it"
     if said is None or said == taken:
         return ""
     law = f"; `metadata: {{controller: {{{drive}: {{law: {_TAKEN[said]}, ...}}}}}}` declares the law that follows it"

@@ -1,6 +1,6 @@
 """Files of logs as people write them: is each read rightly, or refused with the key that mends it?
 
-    python benchmarks/tests/log_dialects.py [--only WORD ...] [--out rows.json] [--verbose]
+    python benchmarks/tests/log_dialects.py [--second] [--only WORD ...] [--out rows.json] [--verbose]
 
 The faults stand in log_dialects_texts.py, log_dialects_names.py and log_dialects_imports.py: small files whose truth is
 known, each of a kind that people complain about in public. None of them is among the tests of the library, and the
@@ -261,23 +261,27 @@ def _mended(folder: Path, fault: Fault, said: str) -> tuple[str, str]:
     return ("no key", f"{said}\nMENDED: {wrong}\n{more}") if wrong else ("key", said)
 
 
-def every() -> list[Fault]:
-    """All faults."""
+def every(second: bool = False) -> list[Fault]:
+    """All faults of the first list, or of the second."""
     import log_dialects_imports
     import log_dialects_names
+    import log_dialects_second
     import log_dialects_texts
 
+    if second:
+        return log_dialects_second.FAULTS
     return [*log_dialects_texts.FAULTS, *log_dialects_names.FAULTS, *log_dialects_imports.FAULTS]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--second", action="store_true", help="the list that was written after the first was mended")
     parser.add_argument("--only", nargs="+", default=[], help="words of the names")
     parser.add_argument("--out", type=Path, help="JSON file of all outcomes")
     parser.add_argument("--verbose", action="store_true", help="what was said of each that is not read rightly")
     args = parser.parse_args(argv)
     rows = []
-    for fault in every():
+    for fault in every(args.second):
         if args.only and not any(word in fault.name for word in args.only):
             continue
         with tempfile.TemporaryDirectory() as folder:

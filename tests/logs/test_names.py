@@ -47,6 +47,7 @@ def test_an_unknown_word_behind_a_joint_is_asked_about() -> None:
         ("knee_torque_cmd", "m_knee", True), ("knee_cmd", "m_knee", True), ("knee_target_pos", "m_knee", False),
         ("pan_target_pos", "pan", True), ("pan_cmd_vel", "pan", False), ("pan_target_deg", "pan", True),
         ("wheel_cmd_vel", "wheel", True), ("wheel_goal_position", "wheel", False), ("pan_torque_cmd", "pan", False),
+        ("knee_current_cmd", "m_knee", False), ("knee_current_cmd_mA", "m_knee", True),
     ],
 )  # fmt: skip
 def test_a_command_is_what_its_drive_takes(column: str, drive: str, right: bool) -> None:
