@@ -83,8 +83,8 @@ FAULTS = [
           ("did you mean",), {"time": "Time", "ctrl": {"m_shoulder": "Ctrl:m_shoulder", "m_elbow": "CTRL:m_elbow"},
           "qpos": {"shoulder": "QPos:shoulder", "elbow": "qPos:elbow"}}),
     Fault("blanks behind the colons", CASES, csv(text(A, "time,ctrl: m_shoulder,ctrl: m_elbow,qpos: shoulder,"
-          "qpos: elbow")), ("did you mean", "in a map takes it"), {"ctrl": {"m_shoulder": "ctrl: m_shoulder", "m_elbow": "ctrl: m_elbow"},
-          "qpos": {"shoulder": "qpos: shoulder", "elbow": "qpos: elbow"}}),
+          "qpos: elbow")), ("did you mean", "in a map takes it"), {"ctrl": {"m_shoulder": "ctrl: m_shoulder",
+          "m_elbow": "ctrl: m_elbow"}, "qpos": {"shoulder": "qpos: shoulder", "elbow": "qpos: elbow"}}),
     Fault("names of bagpy", BAGPY, csv("\n".join(["Time,name,position_0,position_1,effort_0,effort_1", *(
           f"{t:.6g},\"['shoulder', 'elbow']\",{q1:.9g},{q2:.9g},{u1:.9g},{u2:.9g}" for t, u1, u2, q1, q2 in A)])),
           ("`qpos: {",), "nothing"),
@@ -94,8 +94,8 @@ FAULTS = [
           u1, u2, q1, q2) in enumerate(A))])), ("`qpos: {", "change"), "nothing"),
     Fault("what ros2 topic echo --csv writes", ECHO, csv("".join(f"{17 + i // 100},{i % 100 * 10_000_000},,shoulder,"
           f"elbow,{q1:.9g},{q2:.9g},{u1:.9g},{u2:.9g}\n" for i, (_, u1, u2, q1, q2) in enumerate(A))),
-          ("header: false", "ACTUATOR: COLUMN"), {"header": False, "time": {"column": 0, "nanoseconds": 1}, "qpos": {"shoulder": 5,
-          "elbow": 6}, "ctrl": {"m_shoulder": 7, "m_elbow": 8}}),
+          ("header: false", "ACTUATOR: COLUMN"), {"header": False, "time": {"column": 0, "nanoseconds": 1}, "qpos": {
+          "shoulder": 5, "elbow": 6}, "ctrl": {"m_shoulder": 7, "m_elbow": 8}}),
     in_degrees("shoulderPosDeg"), in_degrees("ShoulderDegrees"), in_degrees("shoulder_deg_filtered"),
     in_degrees("deg_shoulder"), in_degrees("shoulder angle in degrees"), in_degrees("shoulder_pos [deg] (raw)"),
     in_degrees("Shoulder Angle (Degrees)"),

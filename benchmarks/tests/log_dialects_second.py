@@ -1,4 +1,4 @@
-"""A second list of faults, written after the first was mended and before any of it was tried: what nothing was made from."""
+"""A second list of faults, written after the first was mended and before any of it was tried."""
 
 import json
 
@@ -53,8 +53,8 @@ FAULTS = [
           "shoulder_pos,elbow_pos")), ("scale", "Nmm"), {"time": "t", "ctrl": {f"m_{j}": {"column": f"{j}_cmd_Nmm",
           "scale": 1e-3} for j in ("shoulder", "elbow")}, "qpos": {j: f"{j}_pos" for j in ("shoulder", "elbow")}}),
     Fault("currents as the commands of torques", CURRENT, csv(text(A * [1, 2, 2, 1, 1], "t,shoulder_current_cmd,"
-          "elbow_current_cmd,shoulder_pos,elbow_pos")), ("torque_constant",), {"time": "t", "ctrl": {f"m_{j}": {"column":
-          f"{j}_current_cmd", "unit": "A", "torque_constant": 0.5} for j in ("shoulder", "elbow")}, "qpos": {j:
+          "elbow_current_cmd,shoulder_pos,elbow_pos")), ("torque_constant",), {"time": "t", "ctrl": {f"m_{j}": {
+          "column": f"{j}_current_cmd", "unit": "A", "torque_constant": 0.5} for j in ("shoulder", "elbow")}, "qpos": {j:
           f"{j}_pos" for j in ("shoulder", "elbow")}}),
     Fault("setpoints and feedback", UNITS, csv(text(S, "t,pan_pos_setpoint,tilt_pos_setpoint,pan_pos_feedback,"
           "tilt_pos_feedback")), model="servo"),
@@ -111,8 +111,8 @@ FAULTS = [
     Fault("fewer times than states", BAGS, hdf5(t=A[:150, 0]), ("150",), "nothing", convert=(*H5, "--commands_of",
           "m_shoulder", "m_elbow", "--time", "t"), paths=("run.hdf5",)),
     Fault("stamps of a recorder that jumped to the right time", BAGS, mcap(when=lambda i: 10_000_000 * i - (START
-          if i < 50 else 0) + (10**9 if i < 50 else 0), received=lambda i: 10_000_000 * i), ("--stamps received", "gap"),
-          again=("--stamps", "received"), **MCAP),
+          if i < 50 else 0) + (10**9 if i < 50 else 0), received=lambda i: 10_000_000 * i), ("--stamps received",
+          "gap"), again=("--stamps", "received"), **MCAP),
     Fault("json objects over some lines", OBJECTS, {"run.jsonl": json.dumps({"time": A[:, 0].tolist(), "q":
           A[:, 3:].tolist()}).encode()}, ("one object per line", "qpos", "time"), "nothing"),
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Faults of logs' dialects that were once misread or refused without a way on: each is read rightly or names its key."""
+"""Faults of logs' dialects that were once misread or had no way on: each is read rightly or names its key."""
 
 from pathlib import Path
 
