@@ -54,8 +54,8 @@ FAULTS = [
           "scale": 1e-3} for j in ("shoulder", "elbow")}, "qpos": {j: f"{j}_pos" for j in ("shoulder", "elbow")}}),
     Fault("currents as the commands of torques", CURRENT, csv(text(A * [1, 2, 2, 1, 1], "t,shoulder_current_cmd,"
           "elbow_current_cmd,shoulder_pos,elbow_pos")), ("torque_constant",), {"time": "t", "ctrl": {f"m_{j}": {
-          "column": f"{j}_current_cmd", "unit": "A", "torque_constant": 0.5} for j in ("shoulder", "elbow")}, "qpos": {j:
-          f"{j}_pos" for j in ("shoulder", "elbow")}}),
+          "column": f"{j}_current_cmd", "unit": "A", "torque_constant": 0.5} for j in ("shoulder", "elbow")},
+          "qpos": {j: f"{j}_pos" for j in ("shoulder", "elbow")}}),
     Fault("setpoints and feedback", UNITS, csv(text(S, "t,pan_pos_setpoint,tilt_pos_setpoint,pan_pos_feedback,"
           "tilt_pos_feedback")), model="servo"),
     Fault("ticks of a servo", TICKS, csv(text(np.c_[S[:, 0], 2048 + np.round(S[:, 1:] * 4096 / (2 * np.pi))],
