@@ -21,7 +21,7 @@ from bayessim_mjx.logs.turns import TURN, servos
 
 DEGREE = units.ANGLES["deg"]
 PLAIN = ("rad", "m", "rad/s", "m/s", "N m", "N", "V", units.PLAIN, None)
-# Rules of thumb. Of 60 files in degrees 30 are refused and 28 warned of: benchmarks/records/log_checks.json
+# Rules of thumb. Of 60 files in degrees 30 are refused and 30 warned of: benchmarks/records/log_checks.json
 FAR = 3.0  # times a joint's range, which readings in the model's unit never reach, however loose the range is
 ALIKE = 0.8  # correlation from which a joint follows its target; rule of thumb, see FAR
 RATIO = 1.25  # within which a ratio of amplitudes is that of two units; rule of thumb, see FAR
