@@ -18,7 +18,7 @@ from bayessim_mjx.logs.table import Table
 
 G = 9.80665  # m/s^2, standard gravity: the unit g. Source: CGPM 1901
 DEGREE = np.pi / 180.0
-# times the largest step beside it, from which a step is a jump; benchmarks/records/log_dialects.json
+# times the largest step beside it, from which a step is a jump; benchmarks/records/log_checks.json
 SUDDEN = 5.0
 FAST, HIGH = 30.0, 100.0  # m/s and m of a robot's base: rules of thumb, a legged robot in mm is beyond one of them
 HALF = 0.5  # share of the rows, and of a unit's size: which of two readings is the nearer one. Source: the middle
