@@ -23,15 +23,15 @@ _SIGNS = frozenset(b"\xb0\xb2\xb3\xb5\xb7")
 _OTHERS = {
     b"\x1f\x8b": "compressed by gzip: unpack it (gunzip)",
     b"PK\x03\x04": "a ZIP archive or a spreadsheet: unpack it, or export it as CSV",
-    b"BZh": "compressed by bzip2: unpack it",
+    b"BZh91AY": "compressed by bzip2: unpack it",
     b"\xfd7zXZ": "compressed by xz: unpack it",
     b"\x28\xb5\x2f\xfd": "compressed by Zstandard: unpack it",
     b"\xd0\xcf\x11\xe0": "an old spreadsheet: export it as CSV",
-    b"PAR1": "a table of Parquet: write it as CSV (pandas: read_parquet, to_csv)",
+    b"PAR1\x15": "a table of Parquet: write it as CSV (pandas: read_parquet, to_csv)",
     b"\x89HDF": "an HDF5 file: `logs from-hdf5` converts it",
     b"\x89MCAP": "an MCAP file: `logs from-mcap` converts it",
-    b"#ROSBAG": "a bag of ROS 1: `logs from-rosbag` converts it",
-    b"MATLAB 5": "a MAT file: write it as CSV (writetable)",
+    b"#ROSBAG V": "a bag of ROS 1: `logs from-rosbag` converts it",
+    b"MATLAB 5.0 MAT-file": "a MAT file: write it as CSV (writetable)",
 }
 _CANDIDATES = ("latin-1", "cp1250", "cp437", "shift_jis")
 _NAMED = re.compile(r'"?sep=(.)"?\s*')
