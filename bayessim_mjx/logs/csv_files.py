@@ -82,6 +82,7 @@ def read_csv(path: Path, form: Form = Form()) -> Table:  # noqa: B008  # immutab
         raise UserError(at + _why_ragged(text, body, names, delimiter, ragged))
     if form.header and not form.lenient:
         _units_row(path, body, first + kept[0])
+        _header_again(path, lines[0], body, [first + row for row in kept])
     body = [[""] * len(names) if row in ragged else fields for row, fields in enumerate(body)]
     marks = marks_of(body, form.decimal, form.thousands)
     columns = {name: [r[i] for r in body] for i, name in enumerate(names)}
@@ -117,8 +118,8 @@ def _other_delimiter(path: Path, names: Sequence[str], lines: Sequence[Sequence[
 
 
 def _no_header(path: Path, fields: Sequence[str], names: Sequence[str]) -> None:
-    """Refuse a first line of numbers with fractions as a header; whole numbers may be names."""
-    if all(map(is_number, names)) and not all(name.lstrip("+-").isdigit() for name in names):
+    """Refuse a first line with numbers that have fractions as a header; whole numbers may be names."""
+    if any(is_number(name) and not name.lstrip("+-").isdigit() and name.lower() != "nan" for name in names):
         text = f"{path}: the first line ({', '.join(fields[:4])} ...) holds numbers, not names"
         raise UserError(f"{text}; `header: false` in a map numbers the columns from 0, and keeps that line as a row")
 
@@ -133,6 +134,14 @@ def _units_row(path: Path, body: Sequence[Sequence[str]], first: int) -> None:
     if sum(both) >= 2 and all(word or not f.strip() for word, f in zip(words, body[0], strict=True)) and any(words):
         text = f"{path}: line {first} ({', '.join(body[0][:4])} ...) holds words above columns of numbers"
         raise UserError(f"{text}; `skip_after_header: 1` in a map passes over a line of units")
+
+
+def _header_again(path: Path, header: Sequence[str], body: Sequence[Sequence[str]], lines: Sequence[int]) -> None:
+    """Refuse a line of names among the rows: a recorder began anew in the same file."""
+    again = next((line for line, fields in zip(lines, body, strict=True) if fields == header), None)
+    if again is not None:
+        text = f"{path}: line {again} has the names of the columns again; where the clock begins anew there, cut the"
+        raise UserError(f"{text} file into two; where it goes on, `bad_rows: drop` in a map leaves the line out")
 
 
 def _why_ragged(
@@ -183,7 +192,7 @@ def form_of(path: Path) -> dict[str, Any]:
     out: dict[str, Any] = {} if best == "," else {"delimiter": best}
     if first:
         out["skip_rows"] = first
-    if all(map(is_number, rows[first])) and not all(f.strip().lstrip("+-").isdigit() for f in rows[first]):
+    if any(is_number(f) and not f.strip().lstrip("+-").isdigit() for f in rows[first]):
         out["header"] = False
     elif len(rows) > first + 2 and not any(map(is_number, rows[first + 1])) and any(map(is_number, rows[first + 2])):
         out["skip_after_header"] = 1

@@ -21,7 +21,7 @@ from bayessim_mjx.logs.turns import TURN, servos
 
 DEGREE = units.ANGLES["deg"]
 PLAIN = ("rad", "m", "rad/s", "m/s", "N m", "N", "V", units.PLAIN, None)
-# Rules of thumb. Of 60 files in degrees 30 are refused and 28 warned of: benchmarks/records/log_checks.json
+# Rules of thumb. Of 60 files in degrees 30 are refused and 30 warned of: benchmarks/records/log_checks.json
 FAR = 3.0  # times a joint's range, which readings in the model's unit never reach, however loose the range is
 ALIKE = 0.8  # correlation from which a joint follows its target; rule of thumb, see FAR
 RATIO = 1.25  # within which a ratio of amplitudes is that of two units; rule of thumb, see FAR
@@ -129,8 +129,9 @@ def _by_range(table: Table, name: str, x: Array, kind: str, low: float, high: fl
 
 
 def _many_turns(table: Table, name: str, x: Array) -> None:
-    """Two turns to and fro of a joint without a range: rare in rad, usual in degrees."""
-    if np.ptp(x) > 2.0 * TURN and abs(x[-1] - x[0]) < 0.5 * np.ptp(x) and np.abs(np.diff(x)).max() < np.pi:
+    """Two turns one way and two turns back, of a joint without a range: rare in rad, usual in degrees."""
+    up, down = np.max(x - np.minimum.accumulate(x)), np.max(np.maximum.accumulate(x) - x)
+    if min(up, down) > 2.0 * TURN and np.abs(np.diff(x)).max() < np.pi:
         text = f"{table.path}: column {name!r} goes to and fro by {np.ptp(x) / TURN:.3g} turns in rad"
         warnings.warn(f"{text}; degrees would need {_key(name, name, 'deg')} in a map", stacklevel=5)
 

@@ -23,7 +23,7 @@ METADATA = (
 SUFFIXES = (".csv", ".npz", ".jsonl")
 FORMAT = (
     "CSV with the columns time, ctrl:<actuator>, qpos:<joint>[, qvel:<joint>], "
-    "NPZ with time, ctrl, qpos[, qvel], joints, actuators, or JSON lines with the keys of the CSV's columns"
+    "NPZ with time, ctrl, qpos[, qvel], joints, actuators, or JSON lines (.jsonl) with the keys of the CSV's columns"
 )
 
 Paths = str | Path | Sequence[str | Path]

@@ -22,8 +22,9 @@ from bayessim_mjx.logs.importers.publishers import better_order
 from bayessim_mjx.logs.importers.streams import Stream
 from bayessim_mjx.logs.log import Array, Channels, Log
 from bayessim_mjx.logs.mapping import LogMap, Source
+from bayessim_mjx.logs.names import drives
 from bayessim_mjx.logs.pieces import MAX_GAP, SHORT_GAP
-from bayessim_mjx.logs.proposal import Proposal, drives, native, propose
+from bayessim_mjx.logs.proposal import Proposal, native, propose
 from bayessim_mjx.logs.read import read_logs, table_of
 from bayessim_mjx.logs.table import Table
 from bayessim_mjx.logs.transport import described

@@ -11,6 +11,7 @@ import numpy as np
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Array, Channels, Log, suggest
 from bayessim_mjx.logs.signals import estimate_velocity, noise_level
+from bayessim_mjx.logs.stamps import burst
 from bayessim_mjx.logs.table import Table
 
 MIN_ROWS = 10  # of a run between two gaps; rule of thumb, not measured
@@ -47,7 +48,10 @@ def pieces(
             f"after {table.where(int(worst))} (median period {np.median(steps):.4g} s)"
         )
         if not spans:
-            raise UserError(f"{text}; no run of {MIN_ROWS} samples is left; allowed: gaps up to {MAX_GAP:g} periods")
+            text = f"{text}; no run of {MIN_ROWS} samples is left; allowed: gaps up to {MAX_GAP:g} periods"
+            rate = (len(time) - 1) / float(time[-1] - time[0])
+            key = f"`time: {{column: ..., rate: {rate:.6g}}}` in a map spaces them evenly"
+            raise UserError(f"{text}; the rows come in bursts: {key}" if burst(time) else text)
         warnings.warn(f"{text}; cut into {len(spans)} run(s)", stacklevel=2)
     names = [table.path.name] if len(spans) == 1 else [f"{table.path.name}#{k}" for k in range(len(spans))]
     return [

@@ -8,28 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import mujoco
-import numpy as np
 
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.logs import units, vendors
+from bayessim_mjx.logs import names, units, vendors
 from bayessim_mjx.logs.check import STREAMS
 from bayessim_mjx.logs.log import Channels
 from bayessim_mjx.logs.table import Table
-
-_WORDS = {  # of a column's name, besides that of the joint; the first kind that has one of them wins
-    "ctrl": "cmd command commands commanded target goal desired des ctrl control setpoint sp ref reference action u "
-    "soll sollwert consigne",
-    "effort": "effort torque tau current load force iq moment",
-    "qvel": "vel velocity velocities speed qd dq qvel omega rate",
-    "qpos": "pos position positions q angle qpos actual measured meas present state joint encoder enc ist istwert "
-    "winkel",
-}
-KINDS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
-_CLOCK = frozenset(
-    ("t", "time", "timestamp", "timestamps", "stamp", "stamps", "zeit", "clock", "sec", "secs", "seconds")
-)
-_PART = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
-_UNIT = re.compile(r"\s*[\[(<{][^\])>}]*[\])>}]\s*$")
 
 
 @dataclass
@@ -56,14 +40,6 @@ class Proposal:
         return {key: block for key, block in every.items() if block}
 
 
-def parts(name: str) -> tuple[str, ...]:
-    """Words of a name without its unit: `shoulderPos_deg` -> shoulder, pos."""
-    words = [word.lower() for word in _PART.findall(_UNIT.sub("", name))]
-    if len(words) > 1 and units.of_name(name) is not None and units.of_name(f"x_{words[-1]}") is not None:
-        words.pop()
-    return tuple(words)
-
-
 def native(columns: Iterable[str]) -> bool:
     """Whether columns are named as channels already."""
     return any(column.partition(":")[0] in STREAMS and ":" in column for column in columns)
@@ -77,7 +53,7 @@ def propose(columns: Sequence[str], model: mujoco.MjModel | None, table: Table |
         table: the file, whose values say how a vendor's drives were commanded.
     """
     out = Proposal()
-    clocks = [c for c in columns if _is_clock(c)]
+    clocks = [c for c in columns if names.is_clock(c)]
     halves = _halves(columns)
     if halves:
         clocks = list(halves)
@@ -96,18 +72,33 @@ def propose(columns: Sequence[str], model: mujoco.MjModel | None, table: Table |
     found: dict[tuple[str, str], list[str]] = {}
     named = _named(columns, table)
     for column in columns:
-        channel = None if column in clocks else _channel(named.get(column, column), model)
+        channel = None if column in clocks else names.channel(named.get(column, column), model)
         if channel is not None:
             found.setdefault(channel, []).append(column)
     for (kind, name), own in found.items():
-        if len(own) > 1:
-            out.questions.append(f"{kind}.{name} may be {' or '.join(own)}; the map takes none of them")
-            continue
-        block = out.streams if kind == "effort" else getattr(out, kind)
-        block[f"effort:{name}" if kind == "effort" else name] = _entry(out, kind, name, own[0], model)
+        _enter(out, kind, name, own, model)
     if out.qvel and set(out.qvel) != set(Channels.of(model).qvel):
         out.questions.append("qvel names some joints only; `diagnose` allows that, `real.logs` needs all or none")
     return out
+
+
+def _enter(out: Proposal, kind: str, name: str, own: Sequence[str], model: mujoco.MjModel) -> None:
+    """Take a column for a channel, where one alone can be it; else ask."""
+    if not kind:
+        text = f"{' and '.join(own)}: of {name}, and nothing in the name says which quantity it is"
+        out.questions.append(f"{text}; the map leaves it out (qpos, qvel or ctrl: {{{name}: {own[0]}}} takes it)")
+        return
+    if kind == "ctrl":
+        wrong = {column: text for column in own if (text := names.mismatch(column, name, model))}
+        own = [column for column in own if column not in wrong]
+        if not own:
+            out.questions += wrong.values()
+            return
+    if len(own) > 1:
+        out.questions.append(f"{kind}.{name} may be {' or '.join(own)}; the map takes none of them")
+        return
+    block = out.streams if kind == "effort" else getattr(out, kind)
+    block[f"effort:{name}" if kind == "effort" else name] = _entry(out, kind, name, own[0], model)
 
 
 def _of_vendor(
@@ -125,7 +116,7 @@ def _of_vendor(
     by = vendors.numbered(dialect, columns)
     channels = Channels.of(model)
     for number, joint in joints.items():
-        drive = _actuator_of(model, channels, joint)
+        drive = names.drive_of(model, channels, joint)
         for kind, block, name in (("qpos", out.qpos, joint), ("qvel", out.qvel, joint),
                                   ("effort", out.streams, f"effort:{drive}" if drive else "")):  # fmt: skip
             if name and number in by[kind]:
@@ -182,57 +173,6 @@ def _named(columns: Sequence[str], table: Table | None) -> dict[str, str]:
     return out
 
 
-def _is_clock(column: str) -> bool:
-    words = parts(column)
-    return bool(words) and (set(words) <= _CLOCK or (len(words) == 1 and units.of_name(column) in units.TIMES))
-
-
-def _channel(column: str, model: mujoco.MjModel) -> tuple[str, str] | None:
-    """(kind, channel) that a column's name suggests, or None."""
-    channels = Channels.of(model)
-    words = parts(column)
-    single = [j for j, kind in zip(channels.joints, channels.kinds, strict=True) if kind in ("hinge", "slide")]
-    joint, actuator = _longest(words, single), _longest(words, channels.actuators)
-    if joint is None and actuator is None:
-        return None
-    by_drive = actuator is not None and (joint is None or len(parts(actuator)) > len(parts(joint)))
-    rest = set(words) - set(parts(str(actuator if by_drive else joint)))
-    kind = next((k for k, known in KINDS.items() if rest & known), "ctrl" if by_drive else "qpos")
-    if kind in ("qpos", "qvel"):
-        own = joint if joint is not None else _joint_of(model, channels, str(actuator))
-        return None if own is None else (kind, own)
-    drive = actuator if by_drive else _actuator_of(model, channels, str(joint))
-    return None if drive is None else (kind, drive)
-
-
-def _longest(words: Sequence[str], names: Iterable[str]) -> str | None:
-    """Return the name whose words stand in a row among these; the longest, if it is the only one of its length."""
-    fits: dict[int, list[str]] = {}
-    for name in names:
-        own = parts(name)
-        if own and any(tuple(words[i : i + len(own)]) == own for i in range(len(words))):
-            fits.setdefault(len(own), []).append(name)
-    best = fits[max(fits)] if fits else []
-    return best[0] if len(best) == 1 else None
-
-
-def drives(model: mujoco.MjModel, joint: int) -> list[int]:
-    """Return the numbers of the actuators on a joint."""
-    types = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-    on_joint = np.isin(model.actuator_trntype, types)
-    return [int(i) for i in np.flatnonzero(on_joint & (model.actuator_trnid[:, 0] == joint))]
-
-
-def _actuator_of(model: mujoco.MjModel, channels: Channels, joint: str) -> str | None:
-    own = drives(model, channels.joints.index(joint))
-    return channels.actuators[own[0]] if len(own) == 1 else None
-
-
-def _joint_of(model: mujoco.MjModel, channels: Channels, actuator: str) -> str | None:
-    own = [j for j in range(model.njnt) if channels.actuators.index(actuator) in drives(model, j)]
-    return channels.joints[own[0]] if len(own) == 1 else None
-
-
 def _entry(out: Proposal, kind: str, name: str, column: str, model: mujoco.MjModel) -> Any:
     unit = units.of_name(column)
     if kind == "effort" or unit is None or unit in units.TIMES or unit in ("rad", "rad/s"):
@@ -276,4 +216,4 @@ def _short(block: Any) -> str:
     return str(block)
 
 
-__all__ = ["Proposal", "drives", "hint", "missing_of", "native", "parts", "propose"]
+__all__ = ["Proposal", "hint", "missing_of", "native", "propose"]

@@ -21,7 +21,9 @@ from bayessim_mjx.logs.inertial import having, onto_encoders
 from bayessim_mjx.logs.log import HOLDS, Array, Channels, Log, suggest
 from bayessim_mjx.logs.mapping import LogMap
 from bayessim_mjx.logs.pieces import MIN_ROWS, pieces
+from bayessim_mjx.logs.plausible import check_plausible
 from bayessim_mjx.logs.proposal import hint
+from bayessim_mjx.logs.sparse import onto_positions
 from bayessim_mjx.logs.table import Table, read_jsonl, read_npz
 from bayessim_mjx.physics import controllers
 
@@ -81,6 +83,7 @@ def _read_one(
     else:
         columns, sources = _columns(table, channels, log_map)
     table, columns = onto_encoders(table, columns, channels)
+    table, columns = onto_positions(table, columns, channels, log_map.hold == "linear")
     columns, absent = filled(table, columns, channels, mj_model) if partial else (columns, ())
     check_names(table, columns, channels)
     table, columns = oldest_first(table, columns)
@@ -104,6 +107,7 @@ def _read_one(
     check_markers(table, columns, sources, channels, log_map)
     check_units(table, columns, channels, mj_model, log_map, through, declared)
     check_motion(table, columns, channels, mj_model, through, absent, declared)
+    check_plausible(table, columns, channels, mj_model, log_map, absent)
     say_better_clock(table, columns, channels, log_map)
     columns = _with_numbers(table, columns)
     if "condition" in metadata:
@@ -241,9 +245,12 @@ def _known(table: Table, channels: Channels) -> None:
     """Refuse columns of joints that the model lacks: a wrong name, not a joint without an encoder."""
     for stream, allowed in (("qpos", channels.qpos), ("qvel", channels.qvel)):
         for column in table.columns:
-            if column.startswith(f"{stream}:") and column.partition(":")[2] not in allowed:
+            name = column.partition(":")[2]
+            if column.startswith(f"{stream}:") and name not in allowed:
                 names = ", ".join(f"{stream}:{n}" for n in allowed)
-                raise UserError(f"{table.path}: column {column}: the model has no such joint; allowed: {names}")
+                text = f"{table.path}: column {column}: the model has no such joint; allowed: {names}"
+                key = f"`{stream}: {{{name.strip()}: {column!r}}}`"
+                raise UserError(f"{text}; {key} in a map takes it" if name.strip() in allowed else text)
 
 
 def _whole_joints(table: Table, columns: Mapping[str, Array], absent: list[str], channels: Channels) -> None:

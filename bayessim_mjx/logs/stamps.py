@@ -10,6 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import units
+from bayessim_mjx.logs.instants import DAY
 from bayessim_mjx.logs.log import Array
 from bayessim_mjx.logs.table import Table
 
@@ -41,7 +42,7 @@ def seconds_of(raw: Array, table: Table, column: str, suffix: str = "") -> Array
     start = float(seen[0])
     for unit in ("ms", "us", "ns"):
         scale = units.TIMES[unit]
-        if SINCE[0] <= start * scale <= SINCE[1] and _period(step * scale):
+        if SINCE[0] <= start * scale <= SINCE[1] and (_period(step * scale) or not step):
             _say(table, column, f"{unit} since 1970", unit)
             return raw * scale
     if any(a <= start <= b for a, b in DAYS) and step < 1.2e-5 and _period(step * units.TIMES["days"]):
@@ -57,6 +58,7 @@ def seconds_of(raw: Array, table: Table, column: str, suffix: str = "") -> Array
         raise UserError(
             f"{table.path}: column {column!r}: {start:.0f} reads as a date without marks; state {key} in a map"
         )
+    check_digits(raw, table, column)
     named = units.of_name(f"[{suffix.strip()}]") or (None if column == "time" else units.of_name(column))
     unit = named or "s"
     if unit not in units.TIMES:
@@ -80,20 +82,45 @@ def _written_out(start: float) -> bool:
 
 
 def check_counter(raw: Array, table: Table, column: str) -> None:
-    """Whole stamps do not run over: a counter of 16 or 32 bits begins at 0 again.
+    """Stamps do not run over: counters of 16, 24 or 32 bits, and clocks of a day or a week, begin at 0 again.
 
     Raises:
         UserError: they do; names the key `wrap`.
     """
-    steps = np.diff(raw[np.isfinite(raw)])
+    seen = raw[np.isfinite(raw)]
+    steps = np.diff(seen)
     back = steps[steps < 0]
-    if not len(back) or not (raw[np.isfinite(raw)] % 1 == 0).all():
+    if not len(back):
         return
-    forward = float(steps.max())
-    for bits in (16, 32):
-        if ((back + 2**bits > 0) & (back + 2**bits <= 2.0 * forward)).all():
-            text = f"{table.path}: column {column!r} runs back by {-back[0]:.0f}, as a counter of {bits} bits does"
-            raise UserError(f"{text}; `time: {{column: {column!r}, wrap: {2**bits}}}` in a map lets it go on")
+    forward, largest = float(steps.max()), float(np.abs(seen).max())
+    counters = {float(2**bits): f"a counter of {bits} bits" for bits in (16, 24, 32)} if (seen % 1 == 0).all() else {}
+    clocks = {days * DAY / units.TIMES[u]: f"a clock of a {what} in {u}" for days, what in ((1, "day"), (7, "week"))
+              for u in ("s", "ms", "us", "ns")}  # fmt: skip
+    for period, what in (counters | clocks).items():
+        signed = seen.min() < 0 and what.startswith("a counter")
+        if (
+            largest <= (0.5 if signed else 1.0) * period
+            and ((back + period > 0) & (back + period <= 2.0 * forward)).all()
+        ):
+            text = f"{table.path}: column {column!r} runs back by {-back[0]:.9g}, as {what} does"
+            raise UserError(f"{text}; `time: {{column: {column!r}, wrap: {period:.0f}}}` in a map lets it go on")
+
+
+def check_digits(raw: Array, table: Table, column: str) -> None:
+    """Stamps are no times of day that are written as digits, hhmmss.ss, as NMEA does: 101559.99 and then 101600.00.
+
+    Raises:
+        UserError: they are; names the key `format`.
+    """
+    seen = raw[np.isfinite(raw)]
+    if len(seen) < 3 or not ((seen >= 0) & (seen < 240000) & (seen % 100 < 60) & (seen // 100 % 100 < 60)).all():
+        return
+    seconds = seen // 10000 * 3600 + seen // 100 % 100 * 60 + seen % 100
+    steps, plain = np.diff(seconds), np.diff(seen)
+    jumps = plain - steps > 1.0  # where the digits of the seconds begin again
+    if jumps.any() and (steps > 0).all() and _period(float(np.median(steps))) and steps[jumps].max() < 1.0:
+        text = f"{table.path}: column {column!r} reads as hours, minutes and seconds without marks ({seen[0]:.2f})"
+        raise UserError(f"{text}; state `time: {{column: {column!r}, format: '%H%M%S.%f'}}` in a map")
 
 
 def _period(step: float) -> bool:
@@ -148,9 +175,21 @@ def even(raw: Array, rate: float, table: Table, column: str) -> Array:
 
 
 def coarseness(raw: Array) -> float:
-    """s between different stamps, where many rows share each; else 0."""
+    """s between different stamps, where many rows share each, or come in bursts; else 0."""
     steps = np.diff(raw)
-    return float(np.median(steps[steps > 0])) if np.mean(steps == 0) > 0.3 and (steps > 0).any() else 0.0
+    grain = float(np.median(steps[steps > 0])) if np.mean(steps == 0) > 0.3 and (steps > 0).any() else 0.0
+    return grain or burst(raw)
+
+
+def burst(raw: Array) -> float:
+    """s between the bursts in which rows come, ten times as far apart as the rows in them or more; else 0."""
+    steps = np.diff(raw)
+    if len(steps) < WINDOW or not (steps >= 0).all() or not (steps > 0).any():
+        return 0.0
+    wide = steps > 0.1 * steps.max()
+    apart = np.diff(np.flatnonzero(wide))
+    regular = wide.sum() >= WINDOW and np.ptp(steps[wide]) < 0.5 * steps.max() and apart.min() > 1
+    return float(np.median(steps[wide])) if regular and np.ptp(apart) <= 0.5 * np.median(apart) else 0.0
 
 
 def roughness(time: Array, x: Array) -> float:

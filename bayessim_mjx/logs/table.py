@@ -160,7 +160,7 @@ def read_npz(path: Path) -> Table:
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {k: file[k] for k in file.files}
+            arrays = {k: _in_seconds(file[k]) for k in file.files}
     except Exception as error:  # zipfile, numpy and zlib each raise their own kinds for a broken archive
         raise UserError(f"{path}: not a readable NPZ file ({error}); allowed: numpy.savez of plain arrays") from None
     names = {k: tuple(map(str, np.ravel(arrays.pop(k)))) for k in ("joints", "actuators") if k in arrays}
@@ -182,6 +182,13 @@ def read_npz(path: Path) -> Table:
             columns.update({f"{key}[{i}]": c for i, c in enumerate(value.T)})
             widths[key] = value.shape[1]
     return Table(path, columns, None, names, widths)
+
+
+def _in_seconds(x: NDArray[Any]) -> NDArray[Any]:
+    """Dates as seconds since the first of them, spans as seconds, and all else as it is."""
+    if x.dtype.kind not in "mM" or not x.size:
+        return x
+    return (x - x.ravel()[0] if x.dtype.kind == "M" else x) / np.timedelta64(1, "s")
 
 
 # JSON lines: one object per line and sample; objects within it join their keys by `:`, lists number theirs
@@ -231,7 +238,8 @@ def _row(line: str, where: str, commas: bool) -> dict[str, str]:
     try:
         content = json.loads(line)
     except ValueError as error:
-        raise UserError(f"{where}: not JSON ({error}); {ALLOWED}") from None
+        mend = "`bad_rows: drop` in a map leaves such lines out"
+        raise UserError(f"{where}: not JSON ({error}); {ALLOWED}; {mend}") from None
     if not isinstance(content, dict):
         raise UserError(f"{where}: {type(content).__name__} in place of an object; {ALLOWED}")
     out: dict[str, str] = {}

@@ -19,6 +19,20 @@ _BOMS = (  # the longer first: that of UTF-32 begins with that of UTF-16
 )
 # degree, square, cube, micro and middle dot have these bytes in Latin-1 and in the code pages of Windows that follow it
 _SIGNS = frozenset(b"\xb0\xb2\xb3\xb5\xb7")
+# first bytes of files that are no text: what they are, and the way on. Source: their formats
+_OTHERS = {
+    b"\x1f\x8b": "compressed by gzip: unpack it (gunzip)",
+    b"PK\x03\x04": "a ZIP archive or a spreadsheet: unpack it, or export it as CSV",
+    b"BZh91AY": "compressed by bzip2: unpack it",
+    b"\xfd7zXZ": "compressed by xz: unpack it",
+    b"\x28\xb5\x2f\xfd": "compressed by Zstandard: unpack it",
+    b"\xd0\xcf\x11\xe0": "an old spreadsheet: export it as CSV",
+    b"PAR1\x15": "a table of Parquet: write it as CSV (pandas: read_parquet, to_csv)",
+    b"\x89HDF": "an HDF5 file: `logs from-hdf5` converts it",
+    b"\x89MCAP": "an MCAP file: `logs from-mcap` converts it",
+    b"#ROSBAG V": "a bag of ROS 1: `logs from-rosbag` converts it",
+    b"MATLAB 5.0 MAT-file": "a MAT file: write it as CSV (writetable)",
+}
 _CANDIDATES = ("latin-1", "cp1250", "cp437", "shift_jis")
 _NAMED = re.compile(r'"?sep=(.)"?\s*')
 
@@ -37,6 +51,9 @@ def lines_of(path: Path, encoding: str | None, allowed: str) -> list[str]:
         UserError: bytes that the encoding does not have, or that several encodings read differently.
     """
     raw = path.read_bytes()
+    other = next((what for mark, what in _OTHERS.items() if raw.startswith(mark)), None)
+    if other is not None:
+        raise UserError(f"{path}: not a text file but {other}; {allowed}")
     if encoding is not None:
         return _decoded(path, raw, encoding, allowed).splitlines()
     for mark, name in _BOMS:

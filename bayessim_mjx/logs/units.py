@@ -7,7 +7,7 @@ import re
 
 TURN = 2.0 * math.pi
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "days": 86400.0}
-ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0, "rev": TURN}
+ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0, "mdeg": math.pi / 180e3, "rev": TURN}
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TURNING = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rev/s": TURN, "rpm": TURN / 60.0}
 MOVING = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3}
@@ -32,7 +32,7 @@ _SPELT = {
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "millis": "ms", "milliseconds": "ms",
     "us": "us", "µs": "us", "μs": "us", "usec": "us", "micros": "us", "microseconds": "us", "ns": "ns", "nsec": "ns",
     "nanos": "ns", "nanoseconds": "ns", "days": "days",
-    "rad": "rad", "mrad": "mrad", "deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg",
+    "rad": "rad", "mrad": "mrad", "deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "mdeg": "mdeg",
     "rev": "rev", "turns": "rev", "mm": "mm", "cm": "cm", "%": PERCENT, "pct": PERCENT, "percent": PERCENT,
     "counts": COUNTS, "ticks": COUNTS, "steps": COUNTS, "raw": COUNTS,
     "rad/s": "rad/s", "deg/s": "deg/s", "°/s": "deg/s", "dps": "deg/s", "rpm": "rpm", "rev/s": "rev/s", "mm/s": "mm/s",
@@ -46,25 +46,63 @@ _IN_BRACKETS = {
     "radian": "rad", "radians": "rad", "m/s": "m/s", "min": "min", "h": "h", "rev": "rev", "turn": "rev",
     "count": COUNTS, "-": PLAIN,
 }  # fmt: skip
-_END = re.compile(r"(?:[\[(<{]\s*([^\])>}]+?)\s*[\])>}]|(?:^|[_\s.:-])([A-Za-zµμ°%]+(?:/s)?))\s*$")
+# mean nothing else, wherever they stand in a name
+_CERTAIN = frozenset((
+    "deg", "degree", "degrees", "mdeg", "mrad", "rpm", "dps", "pct", "percent", "msec", "usec", "nsec", "millis",
+    "micros", "nanos", "milliseconds", "microseconds", "nanoseconds",
+))  # fmt: skip
+_BRACKET = re.compile(r"[\[(<{]\s*([^\])>}]+?)\s*[\])>}]")
+_LAST = re.compile(r"(?:^|[_\s.:-])([A-Za-zµμ°%]+(?:/s)?)\s*$")
+_PART = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
+
+
+def words_of(name: str) -> list[str]:
+    """Words of a name, parted by marks or by capital letters, in small letters: `shoulderPos_2` -> shoulder, pos, 2."""
+    return [word.lower() for word in _PART.findall(name)]
+
+
+def bare(name: str) -> str:
+    """Return a name without its unit: brackets, and words that are one."""
+    name = _BRACKET.sub(" ", name)
+    last = _LAST.search(name)
+    if last is not None and last[1].lower() in _SPELT and name[: last.start()].strip():
+        return name[: last.start()]
+    found = list(_PART.finditer(name))
+    if len(found) > 1 and len(found[-1][0]) > 1 and found[-1][0].lower() in _SPELT:
+        return name[: found[-1].start()]
+    return "_".join(m[0] for m in found if m[0].lower() not in _CERTAIN) or name
 
 
 def of_name(column: str) -> str | None:
-    """Return the known unit at the end of a column's name (`angle [deg]`, `t_ms`), or None."""
-    match = _END.search(column.strip())
-    if match is None:
-        return None
-    if match[1] is None:
-        return _SPELT.get(match[2].lower())
-    text = re.sub(r"[\s*\u00b7\u22c5]|(?<=\w)[-_](?=\w)", "", match[1].lower())
+    """Return the known unit that a column's name bears (`angle [deg]`, `t_ms`, `shoulderPosDeg`), or None.
+
+    It stands in brackets, as the last word, or, of words that mean nothing else, anywhere. Beside another unit `raw`
+    and `counts` are none.
+    """
+    inside = [_known(match[1]) for match in _BRACKET.finditer(column)]
+    found = [unit for unit in inside if unit is not None]
+    if found:
+        return next((unit for unit in found if unit != COUNTS), COUNTS)
+    name = _BRACKET.sub(" ", column).strip()
+    last = _LAST.search(name)
+    if last is not None and last[1].lower() in _SPELT:
+        return _SPELT[last[1].lower()]
+    words = words_of(name)
+    if len(words) > 1 and len(words[-1]) > 1 and words[-1] in _SPELT:
+        return _SPELT[words[-1]]
+    return next((_SPELT[word] for word in words if word in _CERTAIN), None)
+
+
+def _known(text: str) -> str | None:
+    text = re.sub(r"[\s*\u00b7\u22c5]|(?<=\w)[-_](?=\w)", "", text.lower())
     return _SPELT.get(text) or _IN_BRACKETS.get(text)
 
 
 def foreign(column: str) -> str | None:
-    """Return text in brackets at the end of a name that is neither a known unit nor an index, or None."""
-    match = _END.search(column.strip())
-    known = match is None or match[1] is None or of_name(column) is not None
-    return None if known or match is None or re.fullmatch(r"[\d\s:,]+", match[1]) else match[0].strip()
+    """Return text in brackets in a name that is neither a known unit nor an index, where no unit is known, or None."""
+    if of_name(column) is not None:
+        return None
+    return next((m[0].strip() for m in _BRACKET.finditer(column) if not re.fullmatch(r"[\d\s:,]+", m[1])), None)
 
 
 def scale_of(unit: str, resolution: float | None, torque_constant: float | None) -> float:
@@ -88,7 +126,9 @@ __all__ = [
     "PERCENT",
     "PLAIN",
     "TIMES",
+    "bare",
     "foreign",
     "of_name",
     "scale_of",
+    "words_of",
 ]

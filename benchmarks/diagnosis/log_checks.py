@@ -138,6 +138,38 @@ def _jittered(rows: Array, header: Sequence[str], rng: np.random.Generator) -> A
     return out
 
 
+def _first(rows: Array, header: Sequence[str]) -> int:
+    """Return the column of the first position that moves by more than 0.05."""
+    return next(i for i, n in enumerate(header) if n.startswith("qpos:") and np.ptp(rows[:, i]) > 0.05)
+
+
+def _anew(rows: Array, header: Sequence[str], rng: np.random.Generator) -> Array:
+    """From the row of its largest size on, in the middle half of the file, a position counts from 0."""
+    out, i, quarter = rows.copy(), _first(rows, header), len(rows) // 4
+    row = quarter + int(np.argmax(np.abs(rows[quarter : 3 * quarter, i])))
+    out[row:, i] -= rows[row, i]
+    return out
+
+
+def _off(share: float) -> Callable[[Array, Sequence[str], np.random.Generator], Array]:
+    """Return what moves one sample of a position by a share of its range."""
+
+    def moved(rows: Array, header: Sequence[str], rng: np.random.Generator) -> Array:
+        out, i = rows.copy(), _first(rows, header)
+        out[len(rows) // 2, i] += share * np.ptp(rows[:, i])
+        return out
+
+    return moved
+
+
+def _still(rows: Array, header: Sequence[str], rng: np.random.Generator) -> Array:
+    """Hold a position for 0.3 s from where it is fastest, in the second quarter of the file."""
+    out, i, quarter = rows.copy(), _first(rows, header), len(rows) // 4
+    row = quarter + int(np.argmax(np.abs(np.diff(rows[:, i]))[quarter : 2 * quarter]))
+    out[row : row + max(5, int(0.3 / np.median(np.diff(rows[:, 0])))), i] = rows[row, i]
+    return out
+
+
 FILES: dict[str, Callable[[Array, Sequence[str], np.random.Generator], Array]] = {
     "as it is": lambda rows, header, rng: rows,
     "a gap of 4 periods": lambda rows, header, rng: np.delete(rows, range(40, 43), axis=0),
@@ -145,6 +177,10 @@ FILES: dict[str, Callable[[Array, Sequence[str], np.random.Generator], Array]] =
     "each seventh row again": lambda rows, header, rng: np.repeat(rows, 1 + (np.arange(len(rows)) % 7 == 0), axis=0),
     "positions in degrees": _in_degrees,
     "stamps that jitter": _jittered,
+    "a position that begins anew": _anew,
+    "a sample off by 20 %": _off(0.2),
+    "a sample off by 5 %": _off(0.05),
+    "0.3 s of one value": _still,
 }
 
 
@@ -193,8 +229,10 @@ def table(rows: Sequence[dict[str, Any]]) -> None:
     for name in FILES:
         own = [r for r in rows if r.get("file") == name]
         print(f"\nfile, {name}: refused {share([bool(r['refused']) for r in own])}", end="; ")
+        print(f"in one piece {share([r['pieces'] == 1 for r in own])}", end=", ")
         print(
-            f"in one piece {share([r['pieces'] == 1 for r in own])}, warned of {share([bool(r['said']) for r in own])}"
+            f"warned of {share([bool(r['said']) for r in own])}, "
+            f"jumps named {share([any('it jumps' in text for text in r['said']) for r in own])}"
         )
 
 

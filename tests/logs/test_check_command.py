@@ -8,7 +8,8 @@ import pytest
 
 from bayessim_mjx import import_logs
 from bayessim_mjx.logs import read_logs
-from bayessim_mjx.logs.proposal import parts, propose
+from bayessim_mjx.logs.names import parts
+from bayessim_mjx.logs.proposal import propose
 from tests.logs.importing import error, model_of
 from tests.logs.log_files import ARM, HEADER, rows, write
 

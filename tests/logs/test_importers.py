@@ -206,7 +206,9 @@ def test_arrays_of_an_hdf5_file_are_logs(tmp_path: Path, capsys: pytest.CaptureF
             tmp_path / "runs" / "run_demo_2.csv", mujoco.MjModel.from_xml_string(ARM), tmp_path / "runs" / "map.yaml"
         )[0]
     )
-    assert "no array at 'observations/qvel'" in error(capsys, *start, "--rate", "200", "--out", tmp_path / "x")
+    call(capsys, *start, "--rate", "200", "--out", tmp_path / "usual")  # of ALOHA's paths, without velocities
+    as_sent(read(tmp_path / "usual"))
+    assert "no array at 'a/b'" in error(capsys, *start, "--velocities", "a/b", "--rate", "200", "--out", tmp_path / "x")
     assert "neither --time nor --rate" in error(capsys, *start, "--out", tmp_path / "x")
     assert "has 1" in error(capsys, *start[:-1], *arrays, "--rate", "200", "--out", tmp_path / "x")
 

@@ -20,6 +20,7 @@ from bayessim_mjx.logs.vendors import is_servo
 HEAD = """# How the columns of the files beside it become channels of the model (docs/logs.md).
 # Measured signals were interpolated linearly onto the times of the positions, commands averaged over each row.
 """
+AT_ONCE = 10_000  # rows whose texts are made together; any number serves
 
 
 @dataclass
@@ -57,6 +58,7 @@ class Target:
                 self.notes.append(f"{recording.name}: {left_out} row(s) left out, where something was not sampled")
             every |= dict.fromkeys(columns)
             self.notes += [note for note in recording.notes if note not in self.notes]
+            self._check(recording.name, columns)
             self._doubt(recording.name, columns)
             written.append(_csv(self.folder / f"{recording.name}.csv", columns))
             laws = {d: law for j, law in recording.laws.items() if (d := self._actuator(f"law:{j}")) and self._open(d)}
@@ -68,6 +70,22 @@ class Target:
             raise UserError("nothing was recorded; allowed: files with at least one run")
         (self.folder / "map.yaml").write_text(HEAD + yaml.safe_dump(self._map(list(every)), sort_keys=False, width=110))
         return written
+
+    def _check(self, name: str, columns: Mapping[str, Array]) -> None:
+        """Refuse a recording of which no joint, or no command, is in the model, before anything is written."""
+        if self.model is None:
+            return
+        channels = Channels.of(self.model)
+        kinds = (("position", "joint", self._joint, channels.qpos, "--rename NAME=JOINT"),
+                 ("command", "command", self._actuator, channels.actuators,
+                  "--rename NAME=ACTUATOR, or --commands TOPIC=A,B for arrays"))  # fmt: skip
+        for prefix, what, of, allowed, way in kinds:
+            own = [c for c in columns if c.startswith(f"{prefix}:")]
+            if allowed and not any(of(c) for c in own):
+                has = ", ".join(self._name(c) for c in own) or "none"
+                raise UserError(
+                    f"{name}: no recorded {what} is in the model; it has {has}; {suggest('', allowed)}; {way}"
+                )
 
     def _doubt(self, name: str, columns: Mapping[str, Array]) -> None:
         positions = [c for k, c in columns.items() if k.startswith("position:")]
@@ -139,8 +157,6 @@ class Target:
         if self.model is None:
             return qpos, ctrl
         channels = Channels.of(self.model)
-        if not joints:
-            raise UserError(f"no recorded joint is in the model; {suggest('', channels.qpos)}; --rename NAME=JOINT")
         rest = {n: {"value": float(self.model.qpos0[i])} for i, n in enumerate(channels.qpos) if n not in joints}
         idle = {n: {"value": 0.0} for n in channels.actuators if n not in drives}
         for what, absent in (("joint", rest), ("command of", idle)):
@@ -150,8 +166,11 @@ class Target:
 
 
 def _csv(path: Path, columns: Mapping[str, Array]) -> Path:
+    """Write columns [T], a part of the rows at a time: texts of numbers take ten times the numbers' memory."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    rows = zip(*(np.char.mod("%.12g", c) for c in columns.values()), strict=True)
-    lines = [",".join(columns), *(",".join("" if x == "nan" else x for x in row) for row in rows)]
-    path.write_text("\n".join(lines) + "\n")
+    with path.open("w") as file:
+        file.write(",".join(columns) + "\n")
+        for start in range(0, len(columns["time"]), AT_ONCE):
+            part = [np.char.mod("%.12g", c[start : start + AT_ONCE]).tolist() for c in columns.values()]
+            file.writelines(",".join(row).replace("nan", "") + "\n" for row in zip(*part, strict=True))
     return path

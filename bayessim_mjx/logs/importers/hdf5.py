@@ -76,6 +76,8 @@ def _run(path: Path, file: Any, every: Sequence[str], run: str, paths: Paths) ->
     arrays = {}
     for what, pattern in paths.of.items():
         name = pattern.strip("/").replace("*", run)
+        if name not in every and what not in WHAT[:2] and pattern == USUAL.get(what):
+            continue  # a file of ALOHA's form without velocities or efforts
         if name not in every:
             raise UserError(f"{path}: no array at {name!r} (--{what}); {_told(every)}")
         arrays[what] = np.asarray(file[name], float)

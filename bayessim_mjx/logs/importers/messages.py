@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.importers.cdr import faster
 from bayessim_mjx.logs.importers.needs import needs
 from bayessim_mjx.logs.importers.streams import Stream
+from bayessim_mjx.logs.log import Array
 
 STATE, IMU, CONTROLLER = "JointState", "Imu", "JointTrajectoryControllerState"
 DYNAMIC, MULTI, LOW_STATE, LOW_COMMAND = "DynamicJointState", "MultiDOFJointState", "LowState", "LowCmd"
@@ -24,7 +29,7 @@ FAR = 1_000_000_000  # ns between stamp and receipt: two clocks; rule of thumb, 
 Kind = Literal["measured", "held", "linear"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Message:
     """One message; `kind` is its type without the package, `received` in ns.
 
@@ -102,34 +107,100 @@ def streams(samples: Mapping[str, Sequence[tuple[float, float]]], kind: Kind) ->
     }
 
 
+def tracks(messages: Sequence[Message], what: str, when: Callable[[Message], float]) -> dict[str, tuple[Array, Array]]:
+    """{joint: (times, finite values)} of one field of joint states, in the order of the messages.
+
+    Args:
+        what: position, velocity or effort. when: time of a message.
+    """
+    groups: dict[tuple[Any, int], list[int]] = defaultdict(list)
+    for i, message in enumerate(messages):
+        groups[tuple(message.body.name), len(getattr(message.body, what))].append(i)
+    time = np.array([when(m) for m in messages], float)
+    found: dict[str, list[tuple[NDArray[np.int64], Array]]] = defaultdict(list)
+    for (names, count), rows in groups.items():
+        table = np.array([getattr(messages[i].body, what) for i in rows], float).reshape(len(rows), count)
+        for joint, values in zip(names, table.T, strict=False):
+            seen = np.isfinite(values)
+            if seen.any():
+                found[str(joint)].append((np.array(rows)[seen], values[seen]))
+    out = {}
+    for joint, pieces in found.items():
+        at, values = (np.concatenate(each) for each in zip(*pieces, strict=True))
+        order = np.argsort(at, kind="stable")
+        out[joint] = time[at[order]], values[order]
+    return out
+
+
 # MCAP files and ROS bags as messages; the packages that read them are imported here and nowhere else
 
 
 def of_mcap(path: Path) -> Iterator[Message]:
     """Messages of an MCAP file with ROS 2 messages (CDR).
 
+    Of a file without its end, as a recorder leaves it that was killed, all whole messages are read, with a warning.
+
     Raises:
         UserError: the packages are missing, or the file is none.
     """
-    reader_of = needs("mcap.reader", "from-mcap", "mcap").make_reader
+    readers = needs("mcap.reader", "from-mcap", "mcap")
     decoder = needs("mcap_ros2.decoder", "from-mcap", "mcap-ros2-support").DecoderFactory()
-    errors = needs("mcap.exceptions", "from-mcap", "mcap").McapError
+    errors = (needs("mcap.exceptions", "from-mcap", "mcap").McapError, EOFError, struct.error, OSError)
+    read = 0
     try:
         with path.open("rb") as file:
-            reader = reader_of(file, decoder_factories=[decoder])
-            summary = reader.get_summary()
-            schemas = summary.schemas if summary else {}
-            kinds = [(c.topic, _name(schemas.get(c.schema_id))) for c in (summary.channels.values() if summary else ())]
-            topics = [topic for topic, kind in kinds if _short(kind) in KINDS]
-            yield from (Message(topic, kind, 0, None) for topic, kind in kinds if topic not in topics)
-            if summary is not None and not topics:  # an empty list would mean all of them
+            reader, listed = _opened(readers, file, errors)
+            unread = {i: kind for i, (_, kind, used) in listed.items() if not used}
+            yield from (Message(listed[i][0], kind, 0, None) for i, kind in unread.items())
+            topics = [topic for topic, _, used in listed.values() if used]
+            if listed and not topics:  # an empty list would mean all of them
                 return
-            for schema, channel, message, body in reader.iter_decoded_messages(topics=topics or None):
-                kind, sent = _short(_name(schema)), int(message.publish_time or message.log_time)
-                yield Message(channel.topic, kind, sent, body, str(channel.id))
-    except (errors, EOFError, struct.error, OSError) as error:
-        allowed = "allowed: an .mcap file"
-        raise UserError(f"{path}: not a readable MCAP file of ROS 2 messages ({error}); {allowed}") from None
+            decoders: dict[int, Any] = {}
+            for schema, channel, message in reader.iter_messages(topics=topics or None, log_time_order=False):
+                kind, used = _kind(_name(schema), channel.message_encoding)
+                if not used and channel.id not in unread:  # one message says that the topic is not read
+                    unread[channel.id] = kind
+                    yield Message(channel.topic, kind, 0, None)
+                if used:
+                    if channel.id not in decoders:
+                        decoders[channel.id] = faster(_short(kind), decoder.decoder_for("cdr", schema))
+                    body = decoders[channel.id](message.data)
+                    read += 1
+                    sent = int(message.publish_time or message.log_time)
+                    yield Message(channel.topic, _short(kind), sent, body, str(channel.id))
+    except errors as error:
+        why = f"{type(error).__name__}{f': {error}' if str(error) else ''}"
+        mend = "`mcap recover` mends a file whose recorder was killed"
+        if not read:
+            text = f"{path}: not a readable MCAP file of ROS 2 messages ({why}); allowed: an .mcap file"
+            raise UserError(f"{text}; {mend}") from None
+        warnings.warn(f"{path}: it ends in the middle ({why}); {read} messages before are read; {mend}", stacklevel=2)
+
+
+def _opened(
+    readers: Any, file: Any, errors: tuple[type[Exception], ...]
+) -> tuple[Any, dict[int, tuple[str, str, bool]]]:
+    """Open an MCAP file: (a reader, {channel: (topic, type, whether it is read)}).
+
+    Of a file without its end it is a reader from the start, and nothing is listed.
+    """
+    try:
+        reader = readers.make_reader(file)
+        summary = reader.get_summary()
+    except errors:
+        summary = None
+    if summary is None or not summary.channels:
+        file.seek(0)
+        return readers.NonSeekingReader(file), {}
+    names = {c.id: _name(summary.schemas.get(c.schema_id)) for c in summary.channels.values()}
+    return reader, {c.id: (c.topic, *_kind(names[c.id], c.message_encoding)) for c in summary.channels.values()}
+
+
+def _kind(name: str, encoding: str) -> tuple[str, bool]:
+    """(type of a channel's messages, whether it is read); of types that could be, how they are written otherwise."""
+    if _short(name) not in KINDS or encoding == "cdr":
+        return name, _short(name) in KINDS
+    return f"{name} written in {encoding}", False
 
 
 def of_rosbag(path: Path) -> Iterator[Message]:

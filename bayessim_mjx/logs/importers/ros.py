@@ -28,6 +28,7 @@ from bayessim_mjx.logs.importers.messages import (
     Kind,
     Message,
     streams,
+    tracks,
 )
 from bayessim_mjx.logs.importers.publishers import better_order, of_one_publisher, several_senders
 from bayessim_mjx.logs.importers.streams import Recording, Stream
@@ -46,6 +47,8 @@ def recording(name: str, messages: Iterable[Message], choice: Choice) -> Recordi
         else:
             topics.unread[message.topic] = message.kind
     by_topic = topics.of
+    for found in by_topic.values():
+        found.sort(key=lambda message: message.received)
     commands = _command_topics(name, topics, choice)
     states = _state_topic(name, topics, choice, commands)
     imus, bodies = topics.of_kind(IMU), topics.of_kind(MULTI)
@@ -168,13 +171,7 @@ def _state_topic(name: str, topics: _Topics, choice: Choice, commands: Iterable[
 
 def _joints(messages: Sequence[Message], what: str, clock: Clock, kind: Kind = "measured") -> dict[str, Stream]:
     """{joint: stream} of one field, whatever the order of joints in each message; fields may be empty."""
-    samples: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    for message in messages:
-        values = getattr(message.body, what)
-        for joint, value in zip(message.body.name, values, strict=False):
-            if np.isfinite(value):
-                samples[str(joint)].append((clock(message), float(value)))
-    return streams(samples, kind)
+    return {joint: Stream(time, x, kind) for joint, (time, x) in tracks(messages, what, clock).items()}
 
 
 def _commands(
