@@ -59,7 +59,7 @@ def diagnose(args: argparse.Namespace) -> None:
     where = "left_out" if args.leave_out_family else "diagnosis"
     todo = [folder for folder in cases(args.cases) if _wanted(folder, where, args)]
     with pool.executor(args.cluster, args.workers, share=False) as calls:
-        running = [calls.submit(_diagnose_one, folder, where, args) for folder in todo]
+        running = [calls.submit(_diagnose_one, folder, where, args, WORKER) for folder in todo]
         for done, each in enumerate(as_completed(running), 1):
             print(f"{done}/{len(todo)} {each.result()}", flush=True)
 
@@ -73,12 +73,12 @@ def _wanted(folder: Path, where: str, args: argparse.Namespace) -> bool:
     return not ended or (args.baselines and not (folder / where / "baselines.json").exists())
 
 
-def _diagnose_one(folder: Path, where: str, args: argparse.Namespace) -> str:
+def _diagnose_one(folder: Path, where: str, args: argparse.Namespace, worker: Path) -> str:
     out = folder / where
     out.mkdir(exist_ok=True)
     for old in ("exit.json", "baselines.json"):
         (out / old).unlink(missing_ok=True)
-    command = [sys.executable, WORKER, folder, "--out", out]
+    command = [sys.executable, worker, folder, "--out", out]
     command += ["--baselines"] if args.baselines and not args.leave_out_family else []
     command += ["--verdict-only"] if args.verdict_only else []
     more = list(args.more)

@@ -35,7 +35,7 @@ def folder(tmp_path, monkeypatch):
 
 def run(folder: Path, **more) -> None:
     given = {"leave_out_family": False, "baselines": False, "verdict_only": False, "workers": 2, "timeout": 60.0}
-    given["more"] = []
+    given |= {"more": [], "cluster": ""}
     command.diagnose(argparse.Namespace(cases=folder, **(given | more)))
 
 

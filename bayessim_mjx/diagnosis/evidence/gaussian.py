@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 from scipy.optimize import minimize
 
-from bayessim_mjx.diagnosis.fitting.quadratic import moving, solve
+from bayessim_mjx.diagnosis.fitting.quadratic import solve
 from bayessim_mjx.diagnosis.selection.numbers import PRIORS
 
 Array = NDArray[np.float64]
@@ -64,7 +64,7 @@ class Windows:
 def windows_of(
     r: Array, A: Array, B: Array, D: Array, offsets: Array, spread: Array, scale: Array, channels: int
 ) -> Windows:
-    """Return the inner products of a fit; of its start states those that move anything (`moving`).
+    """Return the inner products of a fit; of its start states those that move anything.
 
     Args:
         r, A, B: `[W, n]`, `[W, n, k]`, `[W, n, s]`, whitened, rows in the order of time, channels side by side.
@@ -74,7 +74,7 @@ def windows_of(
     count, n = r.shape
     nodes = D.shape[2] // len(scale)
     start = r + np.einsum("wns,ws->wn", B, offsets)  # with the start state as measured
-    own = moving(B)
+    own = B.any((0, 1))
     X = np.concatenate([start[..., None], A, D * np.repeat(scale, nodes), (B * spread)[:, :, own]], 2)
     X = X.reshape(count, n // channels, channels, -1).transpose(2, 0, 3, 1)
     return Windows(X @ X.mT, A.shape[2], len(scale), nodes, n // channels)

@@ -19,7 +19,6 @@ from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import REACH, Fit, broyden, settled
 from bayessim_mjx.diagnosis.fitting.quadratic import blocks, held_out, solve, weights
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
-from bayessim_mjx.diagnosis.fitting.windows import Windows
 
 __all__ = ["Fit", "Fitter", "weights"]
 Array = NDArray[np.float64]
@@ -67,8 +66,11 @@ class Fitter:
         sigma = np.concatenate([windows.sigma_q, windows.sigma_v])
         self.used = np.isfinite(sigma)
         self.sigma = sigma[self.used]
-        motors = simulator.starts > len(windows.spread)
-        self.spread = np.concatenate([windows.spread, _of_motors(windows)]) if motors else windows.spread
+        self.spread = windows.spread
+        if simulator.starts > len(windows.spread):  # of motors, at first: a joint's speed, and a control step of it
+            speed = np.sqrt(np.mean(np.asarray(windows.batch.qvel, np.float64) ** 2, axis=(0, 1)))
+            motors = np.maximum(np.concatenate([windows.dt * speed, speed]), windows.spread)
+            self.spread = np.concatenate([windows.spread, motors])
         self.measured = windows.measured / windows.measured.mean()  # by which windows weigh, one on average
         self.size = windows.steps * int(self.used.sum())
         joints = int((np.isfinite(windows.sigma_q) | np.isfinite(windows.sigma_v)).sum())
@@ -177,13 +179,6 @@ class Fitter:
         start, columns = np.concatenate([fit.values, values]), np.concatenate([fit.A, blank], 2)
         new = Fit(own, start, fit.offsets, fit.r, columns, fit.B, fit.weight, np.inf)
         return replace(new, doubt=fit.doubt, spread=fit.spread)
-
-    def without(self, fit: Fit, own: Sequence[int]) -> Fit:
-        """Return a fit with some of the coordinates, where they are; its first step simulates."""
-        coordinates, values = tuple(fit.coordinates[i] for i in own), fit.values[own]
-        loose = self.simulator.loose(self.vector(coordinates, values))
-        new = Fit(coordinates, values, fit.offsets * loose, fit.r, fit.A[:, :, own], fit.B * loose, fit.weight, np.inf)
-        return replace(new, doubt=fit.doubt, spread=np.where(loose, fit.spread, self.spread))
 
     def _with_motors(self, fit: Fit) -> Fit:
         """Return a new fit with columns of motors that its first point sets loose."""
@@ -325,12 +320,6 @@ class Fitter:
         watched = np.arange(len(self.base), len(fit.coordinates))
         split = functools.partial(blocks, q, starts, fit.r, fit.A)
         return held_out(q, group, fit.weight, precision, pull, low, high, watched, split)
-
-
-def _of_motors(windows: Windows) -> Array:
-    """`[2 nv]`, first standard deviations of motors beside their links: a joint's speed, and a control step of it."""
-    speed = np.sqrt(np.mean(np.asarray(windows.batch.qvel, np.float64) ** 2, axis=(0, 1)))
-    return np.maximum(np.concatenate([windows.dt * speed, speed]), windows.spread)
 
 
 def _each(fit: Fit, r: Array, offsets: Array) -> Array:

@@ -89,34 +89,19 @@ def _dot(a: Array, b: Array) -> Array:
 
 def eliminate(r: Array, A: Array, B: Array, x: Array, spread: Array) -> tuple[Quadratic, Starts]:
     """(quadratic in the parameters, starts) for r `[W, n]`, A `[W, n, K]`, B `[W, n, s]`, x `[W, s]`, spread `[s]`."""
-    own = moving(B)
-    if len(own) == B.shape[2]:
-        return _eliminated(r, A, B, x, spread)
-    q, some = _eliminated(r, A, B[:, :, own], x[:, own], np.broadcast_to(spread, x.shape[1:])[own])
-    M, b = np.tile(np.diag(spread**2), (len(r), 1, 1)), -x / spread**2
-    M[:, own[:, None], own], b[:, own] = some.M, some.b
-    return q, Starts(B, M, b)
-
-
-def moving(B: Array) -> NDArray[np.intp]:
-    """Return which start states move anything in any window."""
-    return np.flatnonzero(B.any((0, 1)))
-
-
-def _eliminated(r: Array, A: Array, B: Array, x: Array, spread: Array) -> tuple[Quadratic, Starts]:
-    M = inverted(B, spread)
-    b = times(B.mT, r) - x / spread**2
-    BA = B.mT @ A  # products of matrices throughout: einsum takes several times as long
-    MBA = M @ BA
-    c = np.sum(r**2, 1) + np.sum((x / spread) ** 2, 1) - _dot(b, times(M, b))
-    g = times(A.mT, r) - times(MBA.mT, b)
+    spread = np.broadcast_to(spread, x.shape[1:])
+    own = np.flatnonzero(B.any((0, 1)))  # the others move nothing, and go back to what was measured
+    B_own, x_own, D = B if len(own) == len(spread) else B[:, :, own], x[:, own], spread[own]
+    inner = np.asarray(np.linalg.inv(B_own.mT @ B_own + np.diag(1 / D**2)), np.float64)
+    pull = times(B_own.mT, r) - x_own / D**2
+    BA = B_own.mT @ A  # products of matrices throughout: einsum takes several times as long
+    MBA = inner @ BA
+    c = np.sum(r**2, 1) + np.sum((x_own / D) ** 2, 1) - _dot(pull, times(inner, pull))
+    g = times(A.mT, r) - times(MBA.mT, pull)
     S = A.mT @ A - BA.mT @ MBA
+    M, b = np.tile(np.diag(spread**2), (len(r), 1, 1)), -x / spread**2
+    M[:, own[:, None], own], b[:, own] = inner, pull
     return Quadratic(c, g, S), Starts(B, M, b)
-
-
-def inverted(B: Array, spread: Array) -> Array:
-    """`[W, s, s]`, posterior covariances of start states with columns B `[W, n, s]` and prior `spread` `[s]`."""
-    return np.asarray(np.linalg.inv(B.mT @ B + np.diag(1 / spread**2)), np.float64)
 
 
 def learnt_spread(r: Array, B: Array, x: Array, spread: Array, weight: Array, own: NDArray[np.intp]) -> Array:
@@ -127,9 +112,9 @@ def learnt_spread(r: Array, B: Array, x: Array, spread: Array, weight: Array, ow
     """
     out, share = spread.copy(), weight / weight.sum()
     for _ in range(RULES.parts if len(own) else 0):
-        M = inverted(B, out)
-        mean = x + times(M, times(B.mT, r) - x / out**2)
-        square = share @ (mean**2 + np.diagonal(M, axis1=1, axis2=2))
+        _, starts = eliminate(r, np.zeros((*r.shape, 0)), B, x, out)
+        mean = x + times(starts.M, starts.b)
+        square = share @ (mean**2 + np.diagonal(starts.M, axis1=1, axis2=2))
         out[own] = np.sqrt(square[own])
     return out
 

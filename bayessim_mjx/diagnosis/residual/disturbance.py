@@ -13,7 +13,7 @@ from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, windo
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
 from bayessim_mjx.diagnosis.fitting import forces
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
-from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate, moving
+from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, PRIORS
 from bayessim_mjx.diagnosis.statistics import Z90, normal_deviate, times, variance_parts
 
@@ -134,7 +134,7 @@ def _force(linear: Linear, found: Learnt) -> Array:
 def _anew(fitter: Fitter, fit: Fit, linear: Linear, found: Learnt) -> tuple[Linear, Array]:
     """(linear model, residuals `[W, n]`) simulated at an estimate and taken back; windows only where it fits better."""
     force, start = _force(linear, found), np.zeros_like(fit.offsets)
-    own = moving(fit.B)
+    own = fit.B.any((0, 1))  # those that `windows_of` takes
     start[:, own] = _means(found)[:, linear.D.shape[2] :] * fit.spread[own]
     theta = fitter.vector(fit.coordinates, fit.values + found.step)
     acting, flat = np.einsum("hm,wmv->whv", linear.basis, force), np.swapaxes(force, 1, 2).reshape(len(force), -1)

@@ -352,4 +352,7 @@ def cut_back(state: SearchState, model: Model, kept: Sequence[Candidate]) -> Fit
     fit, base = model.fit, len(state.fitter.base)
     names = {c.name for e in kept for c in e.coordinates}
     own = [i for i, c in enumerate(fit.coordinates) if i < base or c.name in names]
-    return state.fitter.without(fit, own)
+    coordinates, values = tuple(fit.coordinates[i] for i in own), fit.values[own]
+    loose = state.fitter.simulator.loose(state.fitter.vector(coordinates, values))
+    new = Fit(coordinates, values, fit.offsets * loose, fit.r, fit.A[:, :, own], fit.B * loose, fit.weight, np.inf)
+    return replace(new, doubt=fit.doubt, spread=np.where(loose, fit.spread, state.fitter.spread))
