@@ -56,10 +56,9 @@ def _sampled(found, key):
     own = len(fixed.values)
     precision, neutral = precision[:own], neutral[:own]
     covariance = np.linalg.inv(learnt.Q[1:, 1:] + np.diag(fit.belief()))[:own, :own]
-    rng, draws = np.random.default_rng(0), 400
-    proposal = multivariate_normal(learnt.step[:own], 1.2 * covariance)
-    logs = []
-    for p in np.atleast_2d(proposal.rvs(draws, random_state=rng)):
+    rng, draws = np.random.default_rng(0), 200
+
+    def log_density(p):
         theta = fitter.vector(fixed.coordinates, fixed.values + p)
         r = fitter.whiten(fitter.simulator.run(theta[None], fixed.offsets[None]))[0]
         sizes = fit.spread, weighing.scale, weighing.channels
@@ -68,10 +67,17 @@ def _sampled(found, key):
         whole = Q[1:, 1:] + np.eye(len(Q) - 1)
         cost = Q[0, 0] - Q[1:, 0] @ np.linalg.solve(whole, Q[1:, 0]) + np.linalg.slogdet(whole)[1]
         prior = 0.5 * np.sum(np.log(precision)) - 0.5 * np.sum(precision * (p - neutral) ** 2)
-        likelihood = -0.5 * float(cost + there.logdet.sum())
-        logs.append(likelihood + prior - 0.5 * own * np.log(2 * np.pi) - proposal.logpdf(p))
+        return -0.5 * float(cost + there.logdet.sum()) + prior - 0.5 * own * np.log(2 * np.pi)
+
+    # a fit with friction may rest in a basin beside: the second draws are about what the first ones found
+    centre, width = learnt.step[:own], 2.0 * covariance
+    for _ in range(2):
+        proposal = multivariate_normal(centre, width)
+        each = np.atleast_2d(proposal.rvs(draws, random_state=rng))
+        logs = np.array([log_density(p) for p in each]) - proposal.logpdf(each)
+        weights = np.exp(logs - logsumexp(logs))
+        centre, width = weights @ each, covariance + np.cov(each.T, aweights=weights, ddof=0)
     sampled = logsumexp(logs) - np.log(draws) + learnt.penalty
     # both without the constant (2 pi) of the residuals; accuracies are stated, no number is at a bound
-    weights = np.exp(np.array(logs) - logsumexp(logs))
-    assert 1 / np.sum(weights**2) > 5  # draws that count
+    assert 1 / np.sum(weights**2) > 50  # draws that count
     return scored.found.nats + sum(map(_truncated, fit.coordinates)) - sampled
