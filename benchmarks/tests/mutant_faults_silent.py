@@ -149,7 +149,7 @@ SILENT: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     ),
     (
         "the pull of a start's prior has the other sign", f"{DIAGNOSIS}/fitting/quadratic.py",
-        "b = times(B.mT, r) - x / spread**2", "b = times(B.mT, r) + x / spread**2",
+        "pull = times(B_own.mT, r) - x_own / D**2", "pull = times(B_own.mT, r) + x_own / D**2",
         _tests("diagnosis/fitting/test_quadratic"),
     ),
     (
