@@ -182,7 +182,7 @@ class Effect(abc.ABC):
         return memory, after
 
     def on_motors(
-        self, at: Site, memory: Any, state: "Measurement", ahead: "Measurement", theta: jax.Array
+        self, at: Site, memory: Any, ahead: "Measurement", state: "Measurement", theta: jax.Array
     ) -> "tuple[Any, Measurement]":
         """Change at a start how far and how fast motors are ahead of their links: more, by `ahead`, `[nv]` each.
 

@@ -228,23 +228,20 @@ class Past(struct.PyTreeNode):
         """Return the start with motors further ahead of their links."""
         if self.ahead is None:
             return world
-        ahead = dict(zip(("qpos", "qvel"), jnp.split(self.ahead, 2), strict=True))
-        state, memory = {"qpos": world.qpos, "qvel": world.qvel}, list(world.memory)
-        thetas = self.physics.split(world.theta)[1]
-        for i in self.physics.having("on_motors"):
-            memory[i], state = self.physics.effects[i].on_motors(
-                self.physics.sites[i], memory[i], state, ahead, thetas[i]
-            )
-        return world.replace(memory=tuple(memory), **state)
+        return self._changed("on_motors", dict(zip(("qpos", "qvel"), jnp.split(self.ahead, 2), strict=True)), world)
 
     def _recorded(self, before: World, after: World) -> World:
         """`after`, a recorded state with the memories of `before`, as what follows the motion takes it."""
-        old, new = ({"qpos": world.qpos, "qvel": world.qvel} for world in (before, after))
-        thetas = self.physics.split(before.theta)[1]
-        memory = list(after.memory)
-        for i in self.physics.having("on_record"):
-            memory[i], new = self.physics.effects[i].on_record(self.physics.sites[i], memory[i], old, new, thetas[i])
-        return after.replace(memory=tuple(memory), **new)
+        return self._changed("on_record", {"qpos": before.qpos, "qvel": before.qvel}, after)
+
+    def _changed(self, hook: str, given: dict[str, jax.Array], world: World) -> World:
+        """Return the world as the effects' hooks of this name leave it, which get what is `given` and its state."""
+        state, memory = {"qpos": world.qpos, "qvel": world.qvel}, list(world.memory)
+        thetas = self.physics.split(world.theta)[1]
+        for i in self.physics.having(hook):
+            change = getattr(self.physics.effects[i], hook)
+            memory[i], state = change(self.physics.sites[i], memory[i], given, state, thetas[i])
+        return world.replace(memory=tuple(memory), **state)
 
 
 def past_of(physics: Physics, start: World, motion: Motion, active: jax.Array | None = None) -> Past:

@@ -5,6 +5,7 @@ import json
 import numpy as np
 from log_dialects import A, Fault, S, csv, plain, put, text
 from log_dialects_imports import H5, MCAP, START, hdf5, lines, mcap, npz
+from log_dialects_names import DEG, HEAD, named
 
 UNITS = "stackoverflow.com, tag units-of-measurement: units in the names of columns"
 CURRENT = "ROBOTIS-GIT/DynamixelSDK#173: current against torque"
@@ -14,15 +15,7 @@ LATE = "ros2/rosbag2#1240: rows out of order"
 TABLES = "stackoverflow.com, tag csv: tables of other programs"
 OBJECTS = "stackoverflow.com, tag ndjson: other forms of objects"
 BAGS = "foxglove/mcap: the wrong command for a file, other names"
-DEG = 180 / np.pi
-K = np.arange(200)
 ROWS = plain(A).splitlines()
-CTRL = {"m_shoulder": "shoulder_torque_cmd", "m_elbow": "elbow_torque_cmd"}
-HEAD = "t,shoulder_torque_cmd,elbow_torque_cmd"
-
-
-def named(shoulder: str, elbow: str, table: np.ndarray = A) -> dict[str, bytes]:
-    return csv(text(table, f"{HEAD},{shoulder},{elbow}", form="%.9g"))
 
 
 def stamped(make, head: str = "time", table: np.ndarray = A) -> dict[str, bytes]:  # noqa: ANN001

@@ -192,7 +192,7 @@ def shown(at: Site, memory: Any, measurement: Measurement, on: jax.Array, encode
 
 
 def moved(
-    at: Site, memory: Any, state: Measurement, ahead: Measurement, on: jax.Array, encoder: jax.Array
+    at: Site, memory: Any, ahead: Measurement, state: Measurement, on: jax.Array, encoder: jax.Array
 ) -> tuple[dict[str, jax.Array], Measurement]:
     """Move motors further ahead of their links, and whichever of both the encoder does not see."""
     twist, slip = (jnp.where(on, ahead[what][at.dadr], 0.0) for what in ("qpos", "qvel"))
@@ -321,9 +321,9 @@ class OfTransmission:
         return recorded(at, memory, before, after, self.on(at, theta), self._encoder(at, theta))
 
     def on_motors(
-        self, at: Site, memory: Any, state: Measurement, ahead: Measurement, theta: jax.Array
+        self, at: Site, memory: Any, ahead: Measurement, state: Measurement, theta: jax.Array
     ) -> tuple[Any, Measurement]:
-        return moved(at, memory, state, ahead, self.on(at, theta), self._encoder(at, theta))
+        return moved(at, memory, ahead, state, self.on(at, theta), self._encoder(at, theta))
 
     def _encoder(self, at: Site, theta: jax.Array) -> jax.Array:
         encoder = self.encoder(at, theta)
