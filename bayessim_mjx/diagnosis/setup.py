@@ -193,7 +193,7 @@ def _checked(robot: Robot, logs: Sequence[Log], request: Request, looked: Callab
     beginnings, shorter = observation.shortened(found.demand(), seconds)
     whole, bases = observation.completed(beginnings, robot.mj_model)
     found = found.of_logs(whole)
-    said += [*found.warnings, *shorter, *(f"{text} (found, not assumed)" for text in found.findings)]
+    said += [*found.warnings, *shorter, *found.findings]
     said += [] if noise.repeats(found.usable) else [notes.NO_REPEATS]
     return _Checked(pruned(robot, found.usable, dt), dt, found, look, tuple(said), bases)
 

@@ -146,13 +146,17 @@ def looped(log: Log) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Effort:
-    """What drove one joint: signal [T of the log], in the model's unit (N m, N) where `scaled`."""
+    """What drove one joint: signal [T of the log], in the model's unit (N m, N) where `scaled`.
+
+    hold: s that it acts after its rows' stamps on average: half a row, of commands that hold until the next.
+    """
 
     joint: str
     dof: int
     source: str  # ctrl or effort
     signal: Array
     scaled: bool
+    hold: float = 0.0
 
 
 def efforts(log: Log, model: mujoco.MjModel) -> Iterator[Effort]:
@@ -166,7 +170,7 @@ def efforts(log: Log, model: mujoco.MjModel) -> Iterator[Effort]:
         if all(measured(log, i) is not None for i in own):
             yield Effort(joint, dof, "effort", shown[:, dof], False)
         if asked is not None and all(is_effort(model, i) for i in own):
-            yield Effort(joint, dof, "ctrl", asked[:, dof], True)
+            yield Effort(joint, dof, "ctrl", asked[:, dof], True, 0.0 if log.linear else 0.5 * log.period)
 
 
 # What the drives can carry, and how far out: the scale of an unknown payload

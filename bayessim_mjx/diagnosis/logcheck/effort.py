@@ -41,6 +41,7 @@ class Relation:
     Attributes:
         explained: share of the variance, at the best lag that physics allows; None: not tested, `text` says why.
         late: the motion behind the effort; lag: s of it where it is surely another row's and explains something, or 0.
+        hold: s of the lag that a held command makes by itself: half a row.
         mend: what would mend it, or nothing.
     """
 
@@ -49,6 +50,7 @@ class Relation:
     explained: float | None
     late: Late = Late(0.0)
     lag: float = 0.0
+    hold: float = 0.0
     mend: str = ""
     text: str = ""
 
@@ -56,6 +58,11 @@ class Relation:
     def refused(self) -> bool:
         """Too little is explained."""
         return self.explained is not None and self.explained < HALF
+
+    @property
+    def delay(self) -> float:
+        """s by which the motion follows later than a held command would act; 0 where there is no lag."""
+        return self.lag - self.hold if self.lag else 0.0
 
 
 def relations(log: Log, mj_model: mujoco.MjModel, found: Sequence[Effort]) -> list[Relation]:
@@ -81,9 +88,14 @@ def remarks(related: Sequence[Relation]) -> list[Finding]:
             text = f"{r.joint}: no model explains {percent(1 - (r.explained or 0.0))} of its effort ({r.source})"
             out.append(Finding("warning", f"{text} ({r.mend})" if r.mend else text))
         if r.lag:
-            text = f"{r.joint}: its motion follows the effort ({r.source}) {r.lag * 1e3:+.0f} ms late"
+            text = f"{r.joint} follows its {'command' if r.source == 'ctrl' else 'logged effort'}"
+            size = f"{1e3 * abs(r.delay):.0f} ms {'late' if r.delay > 0 else 'early'}"
             physical = 0.0 <= r.lag <= CAUSAL
-            out.append(Finding("finding", text) if physical else Finding("warning", f"{text}: do the clocks agree?"))
+            out.append(
+                Finding("finding", text, r.delay)
+                if physical
+                else Finding("warning", f"{text} {size}: do the clocks agree?")
+            )
     return out
 
 
@@ -99,7 +111,7 @@ def _relation(
     log: Log, mj_model: mujoco.MjModel, effort: Effort, pictures: list[_Picture], laden: bool = False
 ) -> Relation:
     """laden: with an unknown load, which is no fault of a log."""
-    own = Relation(effort.joint, effort.source, None)
+    own = Relation(effort.joint, effort.source, None, hold=effort.hold)
     tests = [t for t in (_Test.of(log, effort, p, laden) for p in pictures) if t.independent >= FEWEST]
     if not tests:
         return replace(own, text="too little motion, free of contacts and limits, to compare the effort with")
@@ -232,7 +244,7 @@ class _Test:
 def _mend(log: Log, mj_model: mujoco.MjModel, now: Relation, curve: Array, test: _Test) -> tuple[float, str]:
     """One remedy that would explain the effort: (how much of it, in words or nothing)."""
     remedies = [
-        (float(curve.max()) if now.lag else 0.0, f"shifting the command by {now.lag:+.3f} s"),
+        (float(curve.max()) if now.lag else 0.0, f"shifting the command by {now.delay:+.3f} s"),
         (test.share(sign=-1.0), "the opposite sign"),
         (_in_radians(log, mj_model, test), "positions in degrees"),
         (test.share(scaled=False) if test.effort.scaled else 0.0, "another scale of the command"),

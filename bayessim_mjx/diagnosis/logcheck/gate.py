@@ -71,7 +71,7 @@ class Gate:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """One sentence each, beginning with the name of the log."""
+        """One sentence each, beginning with the names of the logs."""
         refused = tuple(f"{name}: refused: {reason}" for name, reason in self.refused.items())
         return refused + self._all("warning") + self._not_compared()
 
@@ -124,7 +124,16 @@ class Gate:
         )
 
     def _all(self, kind: str) -> tuple[str, ...]:
-        return tuple(f"{r.log.name}: {text}" for r in self.reports if r.usable for text in r.of(kind))
+        """One sentence for all logs of which the same is said; delays from the shortest to the longest."""
+        each: dict[str, list[tuple[str, float]]] = {}
+        for name, remark in ((r.log.name, x) for r in self.reports if r.usable for x in r.remarks if x.kind == kind):
+            each.setdefault(remark.text, []).append((name, remark.delay))
+        out = []
+        for text, own in each.items():
+            ends = [f"{1e3 * delay:.0f}" for delay in (min(s for _, s in own), max(s for _, s in own))]
+            late = f" {' to '.join(dict.fromkeys(ends))} ms late" if any(s for _, s in own) else ""
+            out.append(f"{listed([name for name, _ in own], most=MOST)}: {text}{late}")
+        return tuple(out)
 
 
 def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:

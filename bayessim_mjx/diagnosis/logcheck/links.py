@@ -277,7 +277,8 @@ def _drives(log: Log, mj_model: mujoco.MjModel, timing: Timing) -> Iterator[Link
             yield _untested(name, effort.joint, "too little motion free of contacts and limits")
             continue
         lag = timing.motion[effort.joint].sure if effort.joint in timing.motion else 0.0
-        link = (*_compare(signal, needed[:, effort.dof], moved.step, rows, lag), lag)
+        late = lag - effort.hold if lag else 0.0  # a held command acts half a row later by itself
+        link = (*_compare(signal, needed[:, effort.dof], moved.step, rows, lag), late)
         yield _link(name, effort.joint, link, log.period, effort.scaled)
 
 

@@ -22,10 +22,11 @@ _FASTEST = {"hinge": 150.0, "slide": 50.0}  # rad/s, m/s; faster: probably anoth
 
 @dataclass(frozen=True)
 class Finding:
-    """One remark on a log: it refuses the log, warns, or is only told."""
+    """One remark on a log: it refuses the log, warns, or is only told; delay: s, which may differ between logs."""
 
     kind: Literal["refused", "warning", "finding"]
     text: str
+    delay: float = 0.0
 
 
 def size(log: Log, dt: float) -> Iterator[Finding]:
