@@ -101,6 +101,11 @@ def figure(data: list[dict], width: int, height: int, *, least: int = LEAST, **l
     return {"data": data, "layout": base | layout, "width": width, "height": height, "least": min(least, width)}
 
 
+def folded(wide: dict[str, Any], narrow: dict[str, Any]) -> dict[str, Any]:
+    """Return a figure that has the layout of another one, of the same traces, on a screen below its least width."""
+    return wide | {"narrow": {k: narrow[k] for k in ("layout", "height", "least")}}
+
+
 def log_ticks(values: Sequence[Any]) -> list[float]:
     """1, 2, 5, 10, 20 ... between the smallest and the largest positive value, thinned out to at most about eight."""
     known = [v for v in values if finite(v) and v > 0]

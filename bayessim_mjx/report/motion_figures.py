@@ -71,7 +71,7 @@ def episodes(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         least=NARROW,
         showlegend=True,
         margin={"l": 120, "r": 20, "t": 30, "b": 48},
-        xaxis=log_axis("gap in noise standard deviations (log scale)", [v for s in stages for v in values[s]]),
+        xaxis=log_axis("gap (noise sd, log scale)", [v for s in stages for v in values[s]]),
         yaxis=axis(tickvals=at, ticktext=names, range=[len(rows) - 0.4, -0.6], ticks="", gridcolor="#f2f4f5"),
         legend={"orientation": "h", "x": 0, "y": 1 + 4 / height, "yanchor": "bottom", "font": {"size": 12}},
     )
@@ -163,6 +163,5 @@ def commands(command: Mapping[str, Any]) -> dict[str, Any]:
         layout[layout_key(x)] = axis(anchor=y, showticklabels=x == last, **across)
         layout[layout_key(y)] = axis(anchor=x, domain=[1 - (k + 0.95) * high, 1 - (k + 0.2) * high], nticks=4)
         titles.append(heading(f"command to {text(name, 40)}", x, y))
-    return figure(
-        data, WIDTH, 84 + 96 * len(rows), annotations=titles, margin={"l": 60, "r": 12, "t": 8, "b": 46}, **layout
-    )
+    margin = {"l": 60, "r": 12, "t": 8, "b": 46}
+    return figure(data, WIDTH, 84 + 96 * len(rows), least=NARROW, annotations=titles, margin=margin, **layout)

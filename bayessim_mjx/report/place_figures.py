@@ -8,11 +8,13 @@ from bayessim_mjx.quantities import finite, unit
 from bayessim_mjx.report.look import (
     DASH,
     FAINT,
+    NARROW,
     STAGE,
     WIDTH,
     axis,
     cells,
     figure,
+    folded,
     heading,
     layout_key,
     log_axis,
@@ -26,7 +28,10 @@ MAPS_PER_ROW = 3
 
 def maps(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Disturbance force on one joint over what it may depend on: mean and interval per bin; significant ones filled."""
-    columns = min(MAPS_PER_ROW, len(rows))
+    return folded(_maps(rows, min(MAPS_PER_ROW, len(rows))), _maps(rows, 1))
+
+
+def _maps(rows: Sequence[Mapping[str, Any]], columns: int) -> dict[str, Any]:
     lines = -(-len(rows) // columns)
     height = 66 + 190 * lines
     places = cells(len(rows), columns, 0.055, 82 / height)
@@ -50,7 +55,7 @@ def maps(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         data,
         WIDTH if columns == 3 else 320 * columns,
         height,
-        least=240 * columns,
+        least=max(240 * columns, NARROW),
         annotations=titles,
         margin={"l": 66, "r": 10, "t": 26, "b": 50},
         **layout,
@@ -121,13 +126,23 @@ PANELS: tuple[tuple[str, str, str, dict[str, Any]], ...] = (  # (quantity, words
 
 def frequency(row: Mapping[str, Any]) -> dict[str, Any]:
     """Gain, phase and coherence from command to motion, measured and simulated; amplitudes by order, if any."""
-    panels = [p for p in PANELS if row.get(f"{p[0]}_real{p[2]}") is not None]
+    count = len(_panels(row)) + bool(row.get("orders"))
+    return folded(_frequency(row, count), _frequency(row, 1))
+
+
+def _panels(row: Mapping[str, Any]) -> list[tuple[str, str, str, dict[str, Any]]]:
+    return [p for p in PANELS if row.get(f"{p[0]}_real{p[2]}") is not None]
+
+
+def _frequency(row: Mapping[str, Any], columns: int) -> dict[str, Any]:
+    panels = _panels(row)
     orders = row.get("orders") or []
     count = len(panels) + bool(orders)
     data: list[dict[str, Any]] = []
     layout: dict[str, Any] = {}
     titles = []
-    for k, (across, _) in enumerate(cells(count, count, 0.075, 0)):
+    height = 110 + 180 * -(-count // max(columns, 1))
+    for k, (across, up) in enumerate(cells(count, columns, 0.075, 82 / height) if count else ()):
         x, y = panel(k)
         if k < len(panels):
             key, words, tail, more = panels[k]
@@ -135,19 +150,20 @@ def frequency(row: Mapping[str, Any]) -> dict[str, Any]:
             layout[layout_key(x)] = log_axis("frequency (Hz)", row["hz"], domain=across, anchor=y)
             both = [v for who in ("real", "sim") for v in row.get(f"{key}_{who}{tail}") or []]
             logs = key == "gain" and any(finite(v) and v > 0 for v in both)
-            layout[layout_key(y)] = (log_axis("", both, anchor=x) if logs else axis(anchor=x, nticks=6)) | more
+            place = {"anchor": x, "domain": up} | more
+            layout[layout_key(y)] = log_axis("", both, **place) if logs else axis(nticks=6, **place)
         else:
             words = "residual by order"
             data.append(_by_order(orders, x, y))
             layout[layout_key(x)] = axis("cycles per revolution", domain=across, anchor=y, showgrid=False)
-            layout[layout_key(y)] = axis(anchor=x, nticks=6)
+            layout[layout_key(y)] = axis(anchor=x, nticks=6, domain=up)
         titles.append(heading(words, x, y))
-    legend = {"orientation": "h", "x": 0, "y": 1.13, "yanchor": "bottom", "font": {"size": 12}}
+    legend = {"orientation": "h", "x": 0, "y": 1 + 23 / (height - 110), "yanchor": "bottom", "font": {"size": 12}}
     return figure(
         data,
         WIDTH,
-        290,
-        least=720,
+        height,
+        least=NARROW if columns <= 1 else 720,
         showlegend=bool(panels),
         annotations=titles,
         legend=legend,

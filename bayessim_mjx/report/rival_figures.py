@@ -10,12 +10,14 @@ from bayessim_mjx.report.look import (
     COLUMN,
     FAINT,
     INK,
+    NARROW,
     OVER,
     STAGE,
     WIDTH,
     axis,
     cells,
     figure,
+    folded,
     heading,
     layout_key,
     note,
@@ -37,13 +39,18 @@ def groups(
     names: Sequence[str], parameters: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Estimates of each parameter per operating condition (mean and 2 sd); dotted: the simulator's own value."""
-    shown = list(parameters.items())[:12]
-    columns = min(3, len(shown))
+    shown = dict(list(parameters.items())[:12])
+    return folded(_groups(names, shown, known, min(3, len(shown))), _groups(names, shown, known, 1))
+
+
+def _groups(
+    names: Sequence[str], shown: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any], columns: int
+) -> dict[str, Any]:
     height = 40 + 176 * -(-len(shown) // columns)
     labels = [text(n, 16) for n in names] if fits(names) else [str(k + 1) for k in range(len(names))]
     data, layout, titles, levels = [], {}, [], []
     places = cells(len(shown), columns, 0.07, 70 / height)
-    for k, ((name, row), (across, up)) in enumerate(zip(shown, places, strict=True)):
+    for k, ((name, row), (across, up)) in enumerate(zip(shown.items(), places, strict=True)):
         x, y = panel(k)
         moves = bool(known.get(name, {}).get("structural"))
         colour = STAGE["nominal"] if moves else STAGE["with_effects"]
@@ -75,7 +82,7 @@ def groups(
         data,
         WIDTH if columns == 3 else 320 * columns,
         height,
-        least=240 * columns,
+        least=max(240 * columns, NARROW),
         annotations=titles,
         shapes=levels,
         margin={"l": 60, "r": 10, "t": 28, "b": 46},
@@ -195,6 +202,7 @@ def importance(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         [bars],
         COLUMN,
         62 + 24 * len(ranked),
+        least=NARROW,
         margin={"l": 130, "r": 12, "t": 8, "b": 44},
         xaxis=axis("importance", rangemode="tozero"),
         yaxis=axis(showgrid=False, ticks=""),

@@ -19,7 +19,7 @@ def test_a_wide_interval_leaves_room_for_the_bars():
 
 def test_a_figure_beside_a_table_is_no_wider_than_its_column():
     drawn = rival_figures.importance([{"input": "hinge speed", "importance": 2.0}])
-    assert drawn["width"] == drawn["least"] == COLUMN
+    assert drawn["least"] <= drawn["width"] == COLUMN
 
 
 def test_the_waterfall_fits_a_phone():

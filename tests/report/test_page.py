@@ -189,6 +189,18 @@ def test_the_page_is_as_wide_as_the_screen(page):
     assert tables == sum(a.get("class") == "scroll" for _, a in page.tags) > 5
 
 
+def test_a_phone_shows_all_figures_whole_but_the_table_of_similarities(page):
+    wide = [f for f in page.figures if f.get("narrow", f)["least"] > 332]
+    assert [f["data"][0]["type"] for f in wide] == ["heatmap"]
+    folded = [f["narrow"] for f in page.figures if "narrow" in f]
+    assert len(folded) == 3 + 3 + 1  # maps, frequency, estimates
+    for figure in folded:
+        axes = {k: own["domain"] for k, own in figure["layout"].items() if k.startswith(("xaxis", "yaxis"))}
+        assert all(own == [0, 1] for k, own in axes.items() if k.startswith("x"))
+        spans = sorted(own for k, own in axes.items() if k.startswith("y"))
+        assert all(a[1] < b[0] for a, b in zip(spans, spans[1:], strict=False))
+
+
 def test_without_effects_nothing_is_drawn_with_them(tmp_path):
     told = dataclasses.replace(fake.full(), verdict="parameters", effects=[], sentences=[])
     page = rendered(told, tmp_path)
