@@ -19,7 +19,7 @@ from bayessim_mjx.config.settings import SEEDS
 from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.outside_tasks import is_file
-from bayessim_mjx.progress import Show, Wanted, shown, stages
+from bayessim_mjx.progress import Show, Wanted, Worded, shown, stages
 from bayessim_mjx.quantities import duration
 
 if TYPE_CHECKING:
@@ -169,20 +169,23 @@ def _diagnose(argv: Sequence[str] | None) -> int:
     from bayessim_mjx import report
     from bayessim_mjx.diagnosis import run
     from bayessim_mjx.diagnosis.fitting.robot import of_file
+    from bayessim_mjx.diagnosis.phrases.stages import doing
     from bayessim_mjx.diagnosis.result import Verdict
 
     began, effects = time.monotonic(), _names(args.effects)
 
-    def early(lines: Sequence[str]) -> None:
-        _told(f"Before any simulation ({time.monotonic() - began:.1f} s):", lines, args.headless)
-
     given = ("map", "group", "tolerance", "accuracy", "payload", "minutes", "quick", "verdict_only", "seed", "out")
     with warnings.catch_warnings(record=True), stages(args.headless) as say:  # what matters is told with the result
+
+        def early(lines: Sequence[str]) -> None:
+            _told(f"Before any simulation ({time.monotonic() - began:.1f} s):", lines, args.headless)
+            say("choosing the simulator's time step", 0, 1)
+
         with run.noting() as notes:
             own = () if args.task else (args.drive, args.packages)
             nominal = (_of_task if args.task else of_file)(args.task or args.model, args.parameters, *own)
         result = run.diagnose(
-            nominal, args.data, effects=effects, progress=say, notes=notes, early=early,
+            nominal, args.data, effects=effects, progress=Worded(say, doing), notes=notes, early=early,
             about={"model": str(args.model or args.task)}, **{key: getattr(args, key) for key in given},
         )  # fmt: skip
         _reported(result, args.out, args.verdict_only, missed, say)
@@ -227,6 +230,7 @@ class _Command(types.ModuleType):
             UserError: model, logs, effects or tolerance are not usable.
         """
         from bayessim_mjx.diagnosis import run
+        from bayessim_mjx.diagnosis.phrases.stages import doing
 
         about = {"model": str(model)} if isinstance(model, str | Path) else {}
         paths = [logs] if isinstance(logs, str | Path) else list(logs)
@@ -234,7 +238,7 @@ class _Command(types.ModuleType):
         with shown(progress) as say:
             with run.noting() as notes:
                 nominal = robot(model, options.pop("parameters", None))
-            given = {"notes": notes, "about": about, "progress": say, "out": out, **options}
+            given = {"notes": notes, "about": about, "progress": Worded(say, doing), "out": out, **options}
             result = run.diagnose(nominal, logs, **given)
             if out is not None:
                 missed = beside([str(path) for path in paths]) if known else None

@@ -182,3 +182,16 @@ class _Caller(Silent):
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
         self.function(stage, done, total)
+
+
+class Worded(Silent):
+    """Passes progress on, each stage in words for people."""
+
+    def __init__(self, show: Show, words: Callable[[str], str]):
+        self.show, self.words = show, words
+
+    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
+        self.show(self.words(stage), done, total, *([note] if note else []))
+
+    def line(self, text: str) -> None:
+        self.show.line(text)

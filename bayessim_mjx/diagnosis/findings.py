@@ -20,7 +20,6 @@ from bayessim_mjx.diagnosis.selection.models import Model
 from bayessim_mjx.diagnosis.selection.numbers import Budget, Progress
 from bayessim_mjx.diagnosis.selection.search_state import SearchState
 from bayessim_mjx.diagnosis.setup import Setup
-from bayessim_mjx.quantities import listed
 
 T = TypeVar("T")
 
@@ -142,18 +141,20 @@ def carry_out(stages: Sequence[Stage], found: Findings, time_left: Budget, obser
     return found
 
 
+BESIDE = "checking and locating the answer"  # what stages do that run together
+
+
 def _together(stages: Sequence[Stage], found: Findings, observer: Observer) -> Findings:
     """Run each stage on a thread: compilation and simulation release Python's lock."""
-    name = listed([s.name for s in stages], most=2)
     done: list[Stage] = []
 
     def one(stage: Stage) -> Findings:
         after = stage.after(found, lambda text, done, total: None)
         done.append(stage)
-        observer.progress(name, len(done), len(stages))
+        observer.progress(BESIDE, len(done), len(stages))
         return after
 
-    observer.progress(name, 0, len(stages))
+    observer.progress(BESIDE, 0, len(stages))
     with ThreadPoolExecutor(len(stages)) as pool:
         running = {stage.name: pool.submit(one, stage) for stage in stages}
         needed = [running[s.name] for s in stages if not s.optional]
