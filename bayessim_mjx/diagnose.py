@@ -169,8 +169,8 @@ def _diagnose(argv: Sequence[str] | None) -> int:
     from bayessim_mjx import report
     from bayessim_mjx.diagnosis import run
     from bayessim_mjx.diagnosis.fitting.robot import of_file
+    from bayessim_mjx.diagnosis.phrases.advice import verdict_of
     from bayessim_mjx.diagnosis.phrases.stages import doing
-    from bayessim_mjx.diagnosis.result import Verdict
 
     began, effects = time.monotonic(), _names(args.effects)
 
@@ -193,7 +193,7 @@ def _diagnose(argv: Sequence[str] | None) -> int:
     if missed:
         _told(f"On this robot and these logs ({missed.page}):", missed.sentences, args.headless)
     best = Path(args.out) / ("diagnosis.json" if args.verdict_only else "report.html")
-    words = Verdict(result.verdict).words
+    words = verdict_of(result).badge
     code = "" if words.lower() == result.verdict else f" ({result.verdict})"
     print(f"{words}{code}, after {duration(time.monotonic() - began)}; open {best}")
     return 0

@@ -10,10 +10,12 @@ from bayessim_mjx.quantities import finite, unit
 from bayessim_mjx.report import marks, motion_figures, rival_figures
 from bayessim_mjx.report.choice import choice
 from bayessim_mjx.report.look import STAGE
-from bayessim_mjx.report.words import accuracy, estimate, known_span, number, percent
+from bayessim_mjx.report.words import accuracy, estimate, known_span, length, number, percent
 
 OVERLAY_NUMBERS = 90_000  # in all overlays together, so that the page stays a few MB
 FEWEST_POINTS = 200
+EVIDENCE = 2  # digits of an expected evidence; no source: a matter of style
+SIZES = ("sigma", "quantum", "rest", "highfrequency")  # of a channel's noise, in its unit
 
 
 def overlays(d: Diagnosis) -> dict[str, Any]:
@@ -132,12 +134,17 @@ def experiment(d: Diagnosis) -> dict[str, Any]:
     pairs = [(label_title(p["a"]), label_title(p["b"]), number(p.get("evidence"))) for p in own.get("pairs") or []]
     return {
         "plan": plan,
-        "evidence": number(plan.get("evidence")) if finite(plan.get("evidence")) else "",
+        "evidence": number(plan.get("evidence"), EVIDENCE) if finite(plan.get("evidence")) else "",
         "figure": motion_figures.commands(command) if command.get("ctrl") and plan else None,
         "heads": heads,
-        "rows": [[cell(r.get(h)) for h in heads] for r in rows] if heads else [],
+        "rows": [[_planned(r.get(h), h) for h in heads] for r in rows] if heads else [],
         "pairs": [dict(zip(("a", "b", "evidence"), p, strict=True)) for p in pairs],
     }
+
+
+def _planned(value: Any, head: str) -> dict[str, Any]:
+    """Return a cell of the menu; the evidence that is expected is known to few digits."""
+    return {"text": number(value, EVIDENCE), "number": True} if head == "evidence" and finite(value) else cell(value)
 
 
 def data(d: Diagnosis) -> dict[str, Any]:
@@ -145,9 +152,16 @@ def data(d: Diagnosis) -> dict[str, Any]:
     noise = d.details.get("noise") or []
     keys = [k for k in ("channel", "sigma", "quantum", "rest", "highfrequency", "source") if any(k in n for n in noise)]
     again = d.details.get("reproducibility") or {}
+    units = {name: row["unit"] for name, row in d.gap.physical.items() if row.get("unit")}
+
+    def shown(row: Mapping[str, Any], key: str) -> dict[str, Any]:
+        """Return a cell; a size in degrees or millimetres where the channel's unit is known."""
+        own, value = units.get(row.get("channel", "")), row.get(key)
+        return {"text": length(value, own), "number": True} if own and key in SIZES and finite(value) else cell(value)
+
     return {
         "heads": keys,
-        "rows": [[cell(n.get(k)) for k in keys] for n in noise],
+        "rows": [[shown(n, k) for k in keys] for n in noise],
         "again": [{"name": k.replace("_", " "), "value": cell(v)["text"]} for k, v in again.items()],
     }
 

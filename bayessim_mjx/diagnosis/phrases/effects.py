@@ -120,27 +120,27 @@ def numbered(effect: FoundEffect) -> str:
     """
     own = words(effect.name)
     name = own.noun if own.lacks.startswith(WRONG) else own.lacks
-    used = _used(effect)
-    if len(used) == 1:
-        ((_, value),) = (quantity(k, v) for k, v in used.items())
+    main = _main(effect)
+    if len(main) == 1:
+        ((_, value),) = (quantity(k, v) for k, v in main.items())
         return own.at(effect.where, f"{name} of {value}")
     numbers = _numbers(effect)
     return own.at(effect.where, name) + (f" ({numbers})" if numbers else "")
 
 
-def _used(effect: FoundEffect) -> dict[str, Estimate]:
-    """Return an effect's numbers without those that are optional and near neutral."""
+def _main(effect: FoundEffect) -> dict[str, Estimate]:
+    """Return an effect's numbers without optional ones, such as the softness of MuJoCo's friction."""
     kind = library.known(effect.name)
     optional = {q.name for q in kind.quantities if q.optional} if kind else set()
-    return {k: v for k, v in effect.parameters.items() if k not in optional or _clear(effect.name, k, v)}
+    return {k: v for k, v in effect.parameters.items() if k not in optional}
 
 
 def _numbers(effect: FoundEffect) -> str:
     """Return the numbers that are clearly away from neutral; a shape's only where the amounts that it shapes are."""
-    kind = library.known(effect.name)
+    kind, main = library.known(effect.name), _main(effect)
     shapes = {q.name for q in kind.quantities if q.shape} if kind else set()
-    clear = {k: quantity(k, v) for k, v in effect.parameters.items() if _clear(effect.name, k, v)}
-    sure = all(k in clear or k in shapes for k in effect.parameters)
+    clear = {k: quantity(k, v) for k, v in main.items() if _clear(effect.name, k, v)}
+    sure = all(k in clear or k in shapes for k in main)
     return ", ".join(" ".join(text) for k, text in clear.items() if sure or k not in shapes)
 
 
@@ -161,8 +161,10 @@ def wrong(effect: FoundEffect) -> str:
     if len(effect.parameters) != 1:
         numbers = _numbers(effect)
         return f"the {name} is not the model's" + (f" ({numbers})" if numbers else "")
-    ((_, value),) = (quantity(k, v) for k, v in effect.parameters.items())
-    neutral = kind.quantities[0].neutral
+    ((own_name, number),) = effect.parameters.items()
+    (_, value), neutral = quantity(own_name, number), kind.quantities[0].neutral
+    if not (number.bound or _clear(effect.name, own_name, number)):
+        return f"the {name} is uncertain ({value}; the model has {neutral:g})"
     if kind.relative:
         (factor,) = effect.parameters.values()
         model = next(iter(effect.modelled.values()), math.nan)
@@ -176,7 +178,7 @@ def lacking(effects: Sequence[FoundEffect]) -> str:
     """Return `the simulator lacks ...; the actuator gain at torque is ...`: each effect with its place and numbers."""
     laws: dict[str, list[FoundEffect]] = {}
     for e in (e for e in effects if not wrong(e)):
-        laws.setdefault(e.name if len(e.parameters) == 1 else f"{e.name}@{e.where}", []).append(e)
+        laws.setdefault(e.name if len(_main(e)) == 1 else f"{e.name}@{e.where}", []).append(e)
     lacks = listed([_law(own) for own in laws.values()])
     parts = [f"the simulator lacks {lacks}"] if lacks else []
     return "; ".join([*parts, *(text for e in effects if (text := wrong(e)))])
@@ -187,7 +189,7 @@ def _law(effects: Sequence[FoundEffect]) -> str:
     if len(effects) == 1:
         return numbered(effects[0])
     own = words(effects[0].name)
-    each = [own.at(e.where, quantity(*next(iter(e.parameters.items())))[1]) for e in effects]
+    each = [own.at(e.where, quantity(*next(iter(_main(e).items())))[1]) for e in effects]
     return f"{own.lacks} of {listed(each, most=MOST)}"
 
 

@@ -22,6 +22,7 @@ from bayessim_mjx.odometry.base import Base
 from bayessim_mjx.odometry.stand import Stand
 from bayessim_mjx.quantities import EXACT, MOST, estimate, extent, finite, listed, number, percent
 
+NEAR = math.log(1.2)  # of a ratio to 180 / pi, within which a wrong unit may be its cause; a rule of thumb, not counted
 STAGES = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
 
 
@@ -262,7 +263,10 @@ def _mechanism(look: Look) -> str:
     parts = [f"{j.name} {percent(j.nominal)}{off.get(j.name, '')}" for j in worst[:MOST] if j.nominal >= LEAST]
     after = max(j.left for j in look.joints)
     tail = f"; at most {percent(after)} with the guesses below" if look.proposals else ""
-    return f"{name}: effort that the model does not explain (rms): {', '.join(parts)}{tail}"
+    factors = {j.name: abs(math.log(j.needs)) for j in look.joints if j.source == "ctrl" and j.needs > 0}
+    turned = [n for n, factor in factors.items() if abs(factor - math.log(math.degrees(1))) < NEAR]
+    unit = f". {listed(turned, most=MOST)} differs by the factor of rad to deg: is its unit right?" if turned else ""
+    return f"{name}: effort that the model does not explain (rms): {', '.join(parts)}{tail}{unit}"
 
 
 def _proposal(p: Proposal) -> str:

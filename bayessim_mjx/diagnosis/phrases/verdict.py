@@ -33,6 +33,7 @@ LEFT = (
 NEAREST = "Nearest effects of the library: {nearest}."
 LITTLE = "At most half is closed: {they} {explain} little of the gap."
 ON_TOP = "Beside {them} a force is missing: that force makes {remains} of the squared gap."
+LARGER = "Beside {them} a force is missing, and it makes more than the whole squared gap."
 FALLS = (
     "On held-out {held} {they} {reduce} the gap from {calibrated} to {with_effects}. This closes {shown} of the "
     "squared gap above the noise."
@@ -160,7 +161,7 @@ def _how_far(d: Diagnosis) -> list[str]:
         if d.verdict == "unexplained":
             out += [LITTLE] if of_rms(far.calibrated, far.with_effects).closed < left else []
             remains = basis.get("remains") or 0.0
-            out += [ON_TOP.replace("{remains}", percent(remains))] if remains > 0 else []
+            out += [(ON_TOP if remains <= 1 else LARGER).replace("{remains}", percent(remains))] if remains > 0 else []
         out += [IMPERFECT] if far.beyond and d.verdict != "unexplained" and left > 0 else []
         loud = left > RELEVANCE.share and not of_one(far.with_effects**2).at_noise
         out += [LEFT] if loud and not far.beyond and d.verdict != "unexplained" else []

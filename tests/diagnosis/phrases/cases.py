@@ -40,6 +40,7 @@ def effect(name, where, closed=0.5, rivals=(), shared=None, **numbers):
 
 FRICTION = effect("coulomb_friction", "hinge", 0.66, level=(0.1497, 0.0087, "N m"))
 GAIN = effect("actuator_gain", "torque", 0.32, gain=(0.698, 0.036, ""))
+UNSURE = effect("actuator_gain", "torque", 0.32, gain=(1.05, 0.55, ""))
 DELAY = effect(
     "actuator_delay", "torque", 0.98, [["actuator_lag@torque"], ["sensor_delay@hinge"]],
     {"effects": ["actuator_delay@torque", "actuator_lag@torque"], "mean": 0.012, "low": 0.01, "high": 0.014,
@@ -119,6 +120,7 @@ def every():
         "unexplained": made("unexplained", flexible=FORCE | {"on": "recalibrated"}, tried=["coulomb_friction"]),
         "unexplained by chance": made("unexplained", flexible=NOTHING, not_tried=short),
         "partly": made("unexplained", [FRICTION], some, remains=0.2, flexible=FORCE),
+        "a model far from the robot": made("unexplained", [UNSURE], some, remains=16.5),
         "nearest": made("unexplained", [GAIN], gap(with_effects=6.0), far_off=(3, 6)),
         "little is closed": made(
             "unexplained", [GAIN], gap(with_effects=8.0), probability=chance, remains=0.4, flexible=NOTHING

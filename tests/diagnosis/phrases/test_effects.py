@@ -1,11 +1,13 @@
 """Effects in words: laws with their places, numbers rounded by their uncertainty, classes of explanations."""
 
+import dataclasses
 import math
 
 import pytest
 
 from bayessim_mjx.diagnosis.correction import Estimate
-from bayessim_mjx.diagnosis.phrases import effects
+from bayessim_mjx.diagnosis.equation_error.inverse_dynamics_check import Joint, Look
+from bayessim_mjx.diagnosis.phrases import effects, notes
 from bayessim_mjx.diagnosis.phrases.effects import by_law, numbered, titled
 from bayessim_mjx.diagnosis.selection.bounds import Bound
 from tests.diagnosis.phrases.cases import effect
@@ -100,3 +102,24 @@ def test_the_shape_of_an_amount_that_may_be_none_is_no_number_of_the_head():
     assert "speed" not in numbered(effect("stribeck_friction", "shoulder", **numbers))
     numbers |= {"excess": (0.09, 0.01, "N m")}
     assert "speed 0.047" in numbered(effect("stribeck_friction", "shoulder", **numbers))
+
+
+def test_a_headline_leaves_optional_numbers_to_the_table():
+    soft = {"level": (0.1497, 0.0087, "N m"), "relaxation": (0.0139, 0.001, "s")}
+    assert numbered(effect("coulomb_friction", "elbow", **soft)) == "Coulomb friction of 0.1497 +- 0.0087 N m at elbow"
+    both = [effect("coulomb_friction", where, **soft) for where in ("elbow", "hip")]
+    assert effects.lacking(both).endswith("0.1497 +- 0.0087 N m at elbow and 0.1497 +- 0.0087 N m at hip")
+
+
+def test_a_number_is_called_wrong_only_where_it_clearly_is():
+    sure, unsure = (effect("actuator_gain", "drive", gain=(*own, "")) for own in ((0.7, 0.04), (1.05, 0.55)))
+    assert effects.wrong(sure) == "the actuator gain at drive is 0.700 +- 0.040, not 1"
+    assert effects.wrong(unsure) == "the actuator gain at drive is uncertain (1.05 +- 0.55; the model has 1)"
+
+
+def test_the_factor_between_degrees_and_radians_is_pointed_out():
+    joints = [Joint("hip", "ctrl", 1.1, 0.1, 0.1, 0.1), Joint("knee", "ctrl", 55.4, 0.98, 0.9, 0.9)]
+    (line,) = notes.first_look(Look(joints=tuple(joints)))
+    assert "knee differs by the factor of rad to deg" in line and "hip differs" not in line
+    of_any_unit = [dataclasses.replace(j, source="effort") for j in joints]
+    assert "rad to deg" not in notes.first_look(Look(joints=tuple(of_any_unit)))[0]
