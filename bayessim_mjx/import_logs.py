@@ -182,7 +182,7 @@ def _logs(argv: Sequence[str] | None) -> int:
 
 
 def _checked(args: argparse.Namespace) -> int:
-    """Print how the logs are read; exit code 0, or 2 where something is missing."""
+    """Print how the logs are read; exit code 0, or 2 where something has to be mended."""
     from bayessim_mjx.logs.overview import overview
 
     path = Path(args.path)
@@ -193,14 +193,14 @@ def _checked(args: argparse.Namespace) -> int:
         print(f"note: {note}")
     if found.map_text:
         _write_map(path, found.map_text)
-    for what in found.missing:
-        print(f"missing: {what}")
-    if not found.missing:
+    for fault in found.faults:
+        print(fault)
+    if not found.faults:
         own = cli.urdf_words(args.drive, args.packages)
         print(
             " ".join(["nothing is missing; next: bayessim-mjx diagnose --model", args.model, *own, "--data", str(path)])
         )
-    return 2 if found.missing else 0
+    return 2 if found.faults else 0
 
 
 def _shown(args: argparse.Namespace) -> int:
@@ -214,8 +214,8 @@ def _shown(args: argparse.Namespace) -> int:
     if args.mcap:
         mcap_file.writer()
     shown = views.view(Path(args.path), _model(args), args.map)
-    for what in shown.overview.missing:
-        print(f"missing: {what}")
+    for fault in shown.overview.faults:
+        print(fault)
     print(f"page: {log_page.write(shown, Path(args.out), Path(args.path).resolve().name)}")
     if args.mcap:
         print(f"mcap: {args.mcap}, {mcap_file.write(Path(args.mcap), shown.sheets)} messages")

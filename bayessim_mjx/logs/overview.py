@@ -15,6 +15,7 @@ import yaml
 
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import inertial, units
+from bayessim_mjx.logs.channel_units import units_of
 from bayessim_mjx.logs.check import needed_columns
 from bayessim_mjx.logs.csv_files import form_of
 from bayessim_mjx.logs.files import SUFFIXES, map_of_folder
@@ -45,7 +46,8 @@ class Overview:
     Attributes:
         columns: rows (column, channel, unit, values, note) of the first file.
         files: rows (file, rows, seconds, rate, jitter, gaps) of each file.
-        notes: warnings and questions. missing: faults that have to be mended before the logs can be used.
+        notes: warnings and questions.
+        missing: channels that the logs need; refused: why they cannot be read. Both have to be mended.
         map_text: the map that was proposed, "" where there is one.
     """
 
@@ -53,7 +55,13 @@ class Overview:
     files: list[tuple[str, ...]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
     map_text: str = ""
+
+    @property
+    def faults(self) -> list[str]:
+        """One line each: missing channels first."""
+        return [*(f"missing: {text}" for text in self.missing), *(f"refused: {text}" for text in self.refused)]
 
 
 def overview(path: Path, model: mujoco.MjModel | None, map_file: str | Path | None = None) -> Overview:
@@ -72,11 +80,9 @@ def overview(path: Path, model: mujoco.MjModel | None, map_file: str | Path | No
     files = _files(path, log_map)
     if log_map is None:
         log_map = _proposed(out, files, model)
-    first = True
-    for file in files:
-        _one(out, file, log_map, model, first)
-        first = False
-    if model is not None and not out.missing:
+    for k, file in enumerate(files):
+        _one(out, file, log_map, model, first=k == 0)
+    if model is not None and not out.faults:
         _read(out, files, log_map, model)
     if model is None:
         out.missing.append("--model FILE: joints and actuators are named by it, and nothing is mapped without")
@@ -113,7 +119,7 @@ def _proposed(out: Overview, files: Sequence[Path], model: mujoco.MjModel | None
             content |= form_of(first)
         table = table_of(first, LogMap.read(content))
     except UserError as error:
-        out.missing.append(str(error))
+        out.refused.append(str(error))
         return LogMap.read(content)
     found = (
         Proposal() if first.suffix == ".npz" or native(table.columns) else propose(list(table.columns), model, table)
@@ -137,8 +143,8 @@ def _one(out: Overview, file: Path, log_map: LogMap, model: mujoco.MjModel | Non
     try:
         table = table_of(file, log_map)
     except UserError as error:
-        if str(error) not in out.missing:
-            out.missing.append(str(error))
+        if str(error) not in out.refused:
+            out.refused.append(str(error))
         return
     sources = _sources(table, log_map)
     with warnings.catch_warnings(record=True) as said:  # of stamps in another unit
@@ -147,7 +153,8 @@ def _one(out: Overview, file: Path, log_map: LogMap, model: mujoco.MjModel | Non
     out.notes += [str(w.message) for w in said]
     if first:
         used = {str(source.column): name for name, source in sources.items()}
-        out.columns += [_column(table, column, used, sources, log_map) for column in table.columns]
+        own = {"time": "s"} | (units_of(model) if model is not None else {})  # of columns that are taken as they are
+        out.columns += [_column(table, column, used, sources, log_map, own) for column in table.columns]
         held = [(n, s) for n, s in sources.items() if s.value is not None]
         out.columns += [("-", name, "", f"{s.value:g}", "held constant by the map") for name, s in held]
     try:
@@ -157,7 +164,7 @@ def _one(out: Overview, file: Path, log_map: LogMap, model: mujoco.MjModel | Non
         out.files.append((file.name, str(table.rows), *_clock(time, log_map)))
     except UserError as error:
         out.files.append((file.name, str(table.rows), "-", "-", "-", "-"))
-        out.missing.append(str(error))
+        out.refused.append(str(error))
         return
     if model is not None and file.suffix != ".npz":
         have = [*sources, *(["time"] if time is not None else [])]
@@ -201,12 +208,14 @@ def _sources(table: Table, log_map: LogMap) -> Mapping[str, Source]:
 
 
 def _column(
-    table: Table, column: str, used: Mapping[str, str], sources: Mapping[str, Source], log_map: LogMap
-) -> tuple[str, ...]:
+    table: Table, column: str, used: Mapping[str, str], sources: Mapping[str, Source], log_map: LogMap,
+    own: Mapping[str, str],
+) -> tuple[str, ...]:  # fmt: skip
     channel = used.get(column, "")
     further = {log_map.time.date: "dates of the time", log_map.time.nanoseconds: "nanoseconds of the time"}
     note = further.get(column, "") if not channel else _how(sources[channel])
-    unit = (sources[channel].unit if channel else None) or units.of_name(column) or ""
+    said = (sources[channel].unit if channel else None) or units.of_name(column)
+    unit = said or ("" if note else own.get(channel, ""))
     try:
         if table.dated(column):
             values, unit = f"{table.columns[column][0]} ...", "date"
@@ -251,14 +260,14 @@ def _clock(time: Array | None, log_map: LogMap) -> tuple[str, ...]:
 
 
 def _read(out: Overview, files: Sequence[Path], log_map: LogMap, model: mujoco.MjModel) -> None:
-    """Read the logs as a diagnosis does; its warnings are notes, its refusal is what is missing."""
+    """Read the logs as a diagnosis does; its warnings are notes."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
             logs = read_logs(files, model, log_map, partial=True)
             out.notes += list(dict.fromkeys(text for log in logs if (text := _order(log, model))))
         except UserError:
-            out.missing += [text for text in (_refusal(file, log_map, model) for file in files) if text]
+            out.refused += [text for text in (_refusal(file, log_map, model) for file in files) if text]
     out.notes += list(dict.fromkeys(str(w.message) for w in said))
 
 

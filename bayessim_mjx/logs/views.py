@@ -76,7 +76,7 @@ def view(path: Path, model: mujoco.MjModel | None, map_file: str | None = None) 
     out = View(overview(path, model, map_file))
     own = map_file or map_of_folder(path)
     log_map = LogMap.read(own) if own is not None else _proposed(out.overview)
-    if model is not None and not out.overview.missing:
+    if model is not None and not out.overview.faults:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the overview has them as notes
             out.sheets = [_sheet(log) for log in read_logs(files_of(path, log_map), model, log_map, partial=True)]
@@ -86,7 +86,7 @@ def view(path: Path, model: mujoco.MjModel | None, map_file: str | None = None) 
     if model is not None:
         out.limits, out.pairs = _limits(model), _driven(model)
     if not out.sheets:
-        raise UserError(f"{path}: no file of it can be read ({'; '.join(out.overview.missing)})")
+        raise UserError(f"{path}: no file of it can be read ({'; '.join(out.overview.refused)})")
     return out
 
 

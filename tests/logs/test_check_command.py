@@ -46,6 +46,20 @@ def test_joints_names_give_a_map_and_missing_commands_are_said_at_once(
         read_logs(folder, MODEL, partial=True)
 
 
+def test_units_that_are_taken_as_the_models_are_shown_and_a_refusal_is_no_missing_channel(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    names = "time,ctrl:m_shoulder,ctrl:m_elbow,qpos:shoulder,qpos:elbow"
+    folder, model = logs_of(tmp_path, rows() * np.array([1, 1, 1, 300, 300]), names), model_of(tmp_path)
+    code, out = check(capsys, folder, "--model", model)
+    assert code == 2 and out.splitlines()[-1].startswith("refused: ") and "missing" not in out
+    units = {row[1]: row[2] for row in (line.split() for line in out.splitlines()) if len(row) > 2}
+    assert units["time"] == "s" and units["qpos:shoulder"] == "rad" and units["ctrl:m_elbow"] == "N", units
+    (folder / "map.yaml").write_text("time: time\nqpos: {elbow: {column: qpos:elbow, scale: 0.01}}\n")
+    _, out = check(capsys, folder, "--model", model)
+    assert "scale 0.01" in out and "qpos:elbow   rad" not in out  # a column that is scaled has a unit of its own
+
+
 def test_a_spreadsheet_becomes_a_log_by_the_map_that_is_proposed(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     table = rows() * np.array([1000, 1, 1, 180 / np.pi, 180 / np.pi])
     (tmp_path / "logs").mkdir()
