@@ -68,7 +68,7 @@ def _show(result: Any) -> None:
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
     if result.findings:
         table = Table(box=None, pad_edge=False, header_style="bold")
-        for title in ("where", "what differs", "unexplained"):
+        for title in ("where", "what differs", "unexplained: before, with it"):
             table.add_column(title, overflow="fold")
         for finding in result.findings:
             table.add_row(words.where(finding), words.sentence(finding), words.evidence(finding))

@@ -118,24 +118,29 @@ class Check:
         return self.folder / "cases" / f"{index:04d}" / seal.SEAL
 
     def begin(self) -> None:
-        """Write the settings, or go on with a check of the same ones.
+        """Write the settings, or go on with a check of the same ones; one without a case is written anew.
 
         Raises:
             UserError: another check lies in the folder.
         """
         path = self.folder / SETTINGS
         own = {k: v for k, v in json.loads(json.dumps(dataclasses.asdict(self))).items() if k != "out"}
-        if not path.exists():
+        if not (path.exists() and (self.folder / "cases").exists()):
             self.folder.mkdir(parents=True, exist_ok=True)
             atomic.write_text(path, json.dumps(own, indent=1))
             return
         before = json.loads(path.read_text())
         differing = [k for k in own if own[k] != before.get(k, own[k])]  # an earlier version had fewer
         if differing:
-            other = ", ".join(f"{k} = {before.get(k)!r}, not {own[k]!r}" for k in differing)
-            raise UserError(
-                f"--out {self.out}: a check with {other} lies there; give another folder, or the same flags"
-            )
+            other = ", ".join(f"{_flag(k, before.get(k))} (now {_flag(k, own[k])})" for k in differing)
+            raise UserError(f"--out {self.out} has a check with {other}; give another folder, or the same flags")
+
+
+def _flag(key: str, value: Any) -> str:
+    """Write a setting as it is given: `--effects backlash,spring`, or `no --effects`."""
+    if isinstance(value, list):
+        value = (" " if key in ("data", "packages", "more") else ",").join(map(str, value))
+    return f"--{key} {value}" if value not in ("", None) else f"no --{key}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

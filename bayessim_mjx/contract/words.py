@@ -225,7 +225,8 @@ def evidence(finding: Finding) -> str:
     """How much of the entries' variance is unexplained before and after the finding; "" where it is not known."""
     if finding.left is None or finding.before is None:
         return ""
-    return f"{percent(finding.before)} to {percent(finding.left)}"
+    before = percent(finding.before) if finding.before <= 1 else "more than all"
+    return f"{before} to {percent(round(finding.left, 4))}"
 
 
 def right(part: str, names: Sequence[str]) -> str:
@@ -264,12 +265,12 @@ def verdict(result: Result) -> str:
     """Write the last line."""
     if result.findings:
         n = len(result.findings)
-        return f"{n} thing{'s' if n > 1 else ''} of the deployed policy differ{'' if n > 1 else 's'} from the contract"
+        return f"{n} thing{'s' if n > 1 else ''} of the deployed policy differ{'' if n > 1 else 's'} from its file"
     if not any(result.compared.get(part) for part in ("observation", "action", "command")):
         return "nothing of observations, actions and commands could be compared"
     if "rebuilt_unlike" in result.notes:
-        return "the log does not show whether the policy is deployed as its contract says"
-    return "the deployed policy is as its contract says, in all that the log shows"
+        return "the log does not show whether the policy is deployed as its file says"
+    return "the deployed policy is as its file says, in all that the log shows"
 
 
 def _text(value: float | str | None) -> str:

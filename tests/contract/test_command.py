@@ -25,7 +25,7 @@ def run(*argv: object) -> int:
 def test_right_is_0(policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     robots.write_log(tmp_path / "logs" / "run.csv")
     assert run(policy, "--logs", tmp_path / "logs") == 0
-    assert "is as its contract says" in capsys.readouterr().out
+    assert "is as its file says" in capsys.readouterr().out
 
 
 def test_a_difference_is_1_and_is_written(policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
