@@ -42,7 +42,7 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
 
 def _prediction(found: Mapping[str, Any]) -> str:
     was, now = (compact(mean_return(found, "nominal", s)) for s in ("nominal", "corrected"))
-    text = f"The policy {ROLES['nominal']} was predicted to reach {was} there; the corrected simulator predicts {now}"
+    text = f"For the policy {ROLES['nominal']}, that simulator predicts {was} and the corrected one {now}"
     if not found["gap"]:
         better = compact(mean_return(found, "corrected", "corrected"))
         return f"{text}, and {better} after retraining on it."

@@ -71,7 +71,10 @@ def _tile(d: Diagnosis, stage: str) -> dict[str, str]:
         value, _, unit_ = length(rows[0][stage], rows[0]["unit"]).partition(" ")
         return {"value": value, "unit": unit_, "below": noises}
     if finite(part):
-        return {"value": percent(part), "unit": "of the motion", "below": noises}
+        rough = [(r[stage] / r["motion"], n) for n, r in d.gap.physical.items() if finite(r.get(stage)) and r["motion"]]
+        _, joint = max(rough, default=(0.0, ""))
+        worst = f"; {joint} {length(d.gap.physical[joint][stage], d.gap.physical[joint]['unit'])}" if joint else ""
+        return {"value": percent(part), "unit": "of the motion", "below": noises + worst}
     return {"value": noise_sd(level), "unit": "noise sd", "below": ""}
 
 

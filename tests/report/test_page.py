@@ -248,6 +248,7 @@ def test_what_is_left_beside_effects_is_partly_explained(tmp_path):
 def test_physical_units_come_first(page):
     # 0.041 rad are 2.3 deg; 14.2 noise sd stand below
     assert "2.3 deg14.2 sd" in page.text.replace(" 14.2", "14.2") and "range of motion" in page.text
+    assert "21.4 noise sd; wrist 2.3 deg" in page.text  # of several joints the roughest beside the share
 
 
 def test_the_first_screen_is_verdict_gap_command_and_warnings(tmp_path):

@@ -259,7 +259,8 @@ def _mechanism(look: Look) -> str:
     worst = sorted(look.joints, key=lambda j: -j.nominal)
     if worst[0].nominal < LEAST:
         return f"{name}: the model explains the motion of every joint to {percent(worst[0].nominal)} of the effort"
-    off = {j.name: f" (measured / model = {j.needs:.2f})" for j in worst if abs(j.needs - 1) > LEAST}  # NaN: unknown
+    unlike = [j for j in worst if abs(j.needs - 1) > LEAST]  # NaN: unknown
+    off = {j.name: f" (effort over the model's: {j.needs:.2f})" for j in unlike}
     parts = [f"{j.name} {percent(j.nominal)}{off.get(j.name, '')}" for j in worst[:MOST] if j.nominal >= LEAST]
     after = max(j.left for j in look.joints)
     tail = f"; at most {percent(after)} with the guesses below" if look.proposals else ""
