@@ -123,8 +123,10 @@ def page(found: Found, about: Sequence[str], folder: Path) -> Path:
     """Write the page; returns its path."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+    here = Path(__file__).parent
+    folders = [here, here.with_name("report")]  # the report's has styles and scripts of both
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        loader=FileSystemLoader(folders), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,
     )  # fmt: skip
     text = environment.get_template(TEMPLATE).render(
