@@ -112,13 +112,13 @@ class Stage:
         The verdict stands: a missing picture or proposal must not lose it.
         """
         if (self.patient or self.optional) and time_left.late:
-            return replace(found, warnings=(*found.warnings, notes.left_out(self.name)))
+            return replace(found, warnings=notes.out_of_time(found.warnings, self.name))
         try:
             return self.run(found, say)
         except Exception as error:
             if not self.optional:
                 raise
-            return replace(found, warnings=(*found.warnings, notes.left_out(self.name, error)))
+            return replace(found, warnings=(*found.warnings, notes.failed(self.name, error)))
 
 
 def carry_out(stages: Sequence[Stage], found: Findings, time_left: Budget, observer: Observer) -> Findings:

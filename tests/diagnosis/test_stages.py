@@ -52,7 +52,7 @@ def test_under_a_limit_they_take_turns_and_are_left_out_once_the_time_is_over(fo
     stages = [Stage("a", slow, beside=True, patient=True), Stage("b", adding(Second()), beside=True, patient=True)]
     after = carry_out(stages, found, Budget(10.0, 0.0, lambda: clock[0]), Observer())
     assert First in after.parts and Second not in after.parts
-    assert after.warnings == ("before", "b: left out, the time was over")
+    assert after.warnings == ("before", "the time was over, so these are left out: b")
 
 
 @pytest.mark.parametrize("limit", [float("inf"), 10.0])

@@ -23,14 +23,20 @@ from bayessim_mjx.odometry.stand import Stand
 from bayessim_mjx.quantities import EXACT, MOST, estimate, extent, finite, listed, number, percent
 
 NEAR = math.log(1.2)  # of a ratio to 180 / pi, within which a wrong unit may be its cause; a rule of thumb, not counted
+NO_TIME = "the time was over, so these are left out: "
 STAGES = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": "with the effects"}
 
 
-def left_out(stage: str, error: Exception | None = None) -> str:
-    """Name a stage that failed with an error, or for which the time was over."""
-    if error is None:
-        return f"{stage}: left out, the time was over"
+def failed(stage: str, error: Exception) -> str:
+    """Name a stage that failed with an error."""
     return f"{stage}: not available ({type(error).__name__}: {error})"
+
+
+def out_of_time(warnings: Iterable[str], stage: str) -> tuple[str, ...]:
+    """Return the warnings with a stage for which the time was over; one of them lists all such stages."""
+    known = list(warnings)
+    late = [text.removeprefix(NO_TIME) for text in known if text.startswith(NO_TIME)]
+    return (*(text for text in known if not text.startswith(NO_TIME)), f"{NO_TIME}{', '.join([*late, stage])}")
 
 
 def below_noise(allowed: Tolerance) -> list[str]:
@@ -176,7 +182,7 @@ def inertial(found: Sequence[Base], stands: Sequence[Stand | None]) -> list[str]
     ]
 
 
-NO_REPEATS = "no run was repeated: these logs do not separate chance from an error of the model"
+NO_REPEATS = "no run was repeated: these logs do not show how much of the gap is chance"
 
 
 # The check by inverse dynamics, before any simulation, in lines: command, effort, motion, first guesses

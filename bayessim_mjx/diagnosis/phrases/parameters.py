@@ -7,7 +7,7 @@ from typing import Any
 
 from bayessim_mjx.diagnosis.data_sheet import ACCURACY
 from bayessim_mjx.diagnosis.phrases.effects import CLEAR, any_of, measured
-from bayessim_mjx.quantities import MOST, finite, listed
+from bayessim_mjx.quantities import MOST, finite, listed, percent
 
 STUCK = "At a bound: {named}. They stand in for something missing, or their ranges are too narrow."
 FAR = "Far from the data sheet: {named}."
@@ -48,7 +48,9 @@ def far_from_model(known: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 def less_accurate(found: Mapping[str, tuple[float, float, float]]) -> str:
     """Of kinds of known parameters, {kind: (median, low, high)}, whose accuracy nobody stated."""
-    each = [f"{kind} about {m:.0%} (90 %: {low:.0%} to {high:.0%})" for kind, (m, low, high) in found.items()]
+    each = [
+        f"{kind} about {percent(m)} (90 %: {percent(low)} to {percent(high)})" for kind, (m, low, high) in found.items()
+    ]
     return (
         f"the model's numbers are less accurate than usual: {', '.join(each)}; the intervals allow for it; "
         "--accuracy fixes it"

@@ -141,8 +141,8 @@ def warnings():
     levels = [("0.1 s", 3.0, 1.1), ("whole log", 9.0, 12.0)]
     rows = [{"name": n, "calibrated": c, "with_effects": w, "ci": {"with_effects": [w, w]}} for n, c, w in levels]
     return [
-        notes.left_out("whole logs"),
-        notes.left_out("where", ValueError("no windows")),
+        *notes.out_of_time(notes.out_of_time((), "whole logs"), "next experiment"),
+        notes.failed("where", ValueError("no windows")),
         *notes.below_noise(allowed),
         *notes.rows(0.0001, 0.002, 0.0005, fastest=True),
         *notes.rows(0.001, 0.002, 0.001, fastest=False),
