@@ -11,7 +11,6 @@ from bayessim_mjx.diagnosis.phrases.verdict import number as noise_sd
 from bayessim_mjx.diagnosis.phrases.verdict import with_effects
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.diagnosis.statistics import of_one
-from bayessim_mjx.effects.support.words import spelt
 from bayessim_mjx.quantities import count, finite
 from bayessim_mjx.report import gap_figures, horizon_figures, marks, place_figures
 from bayessim_mjx.report.choice import choice
@@ -25,6 +24,7 @@ from bayessim_mjx.report.words import (
     gap_closed,
     length,
     number,
+    own_number,
     percent,
     quantity,
     repeated,
@@ -35,7 +35,6 @@ from bayessim_mjx.report.words import (
 
 MOST_CANDIDATES = 20  # in the table; no source: a matter of style
 OPEN_WARNINGS = 3  # more are folded away; no source: a matter of style
-TINY = 1e-6  # in SI units: smaller values in the table of candidates are zeros of a fit; no source: a matter of style
 EFFECTS = STAGE["with_effects"]
 TILES = {
     "nominal": "as delivered",
@@ -213,6 +212,7 @@ def candidates(d: Diagnosis) -> dict[str, Any]:
     reach = [c["score"] + k * (c.get("se") or 0.0) for c in shown if finite(c.get("score")) for k in (-2, 2)]
     limits = marks.scale_of(reach, zero=True)
     rows, answer = [], d.rank
+    hinged = all(row.get("unit") == "rad" for row in d.gap.physical.values())
     for k, c in enumerate(shown, 1):
         score, se = c.get("score"), c.get("se") or 0.0
         spans = [(score - m * se, score + m * se) for m in (2, 1)] if finite(score) and finite(se) else [None, None]
@@ -226,7 +226,7 @@ def candidates(d: Diagnosis) -> dict[str, Any]:
                 "chosen": k == answer,
                 "closed": closure(c.get("gap_closed")),
                 "absorbed": percent(c.get("absorbed")),
-                "values": "; ".join(_value(n, v) for n, v in _own(c).items() if n not in d.parameters),
+                "values": "; ".join(own_number(n, v, hinged) for n, v in _own(c).items() if n not in d.parameters),
                 "mark": marks.interval(score, spans[0], limits, colour, (0.0,), inner=spans[1]),
             }
         )
@@ -243,13 +243,6 @@ def _own(candidate: Mapping[str, Any]) -> dict[str, Any]:
     heads = tuple(f"{where}.{name}." for name, _, where in labels)
     values = candidate.get("parameters") or {}
     return {k: v for k, v in values.items() if k.startswith(heads) or "." not in k} if heads else {}
-
-
-def _value(name: str, value: Any) -> str:
-    words = spelt(name.rpartition(".")[2])
-    if isinstance(value, Mapping):
-        return f"{words} {estimate(value.get('mean'), value.get('sd'), value.get('unit', ''))}"
-    return f"{words} {number(0 if finite(value) and abs(value) < TINY else value)}"
 
 
 def where(d: Diagnosis) -> dict[str, Any]:

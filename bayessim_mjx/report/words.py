@@ -5,14 +5,17 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from bayessim_mjx import effects as library
 from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.phrases.effects import label_title, measured
 from bayessim_mjx.diagnosis.phrases.effects import quantity as _quantity
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate
 from bayessim_mjx.diagnosis.statistics import of_rms
+from bayessim_mjx.effects.support.words import spelt
 from bayessim_mjx.quantities import finite, typeset
 
 MISSING = quantities.MISSING  # where there is no number
+TINY = 1e-6  # in SI units: smaller values in the table of candidates are zeros of a fit; no source: a matter of style
 WIDE = 1000  # ratio of an interval's ends, from which on it is not printed in numbers; no source: a matter of style
 # that stay with their number
 UNITS = r"(?<=\d) ± (?=[\d−])|(?<=\d) (?:N m|noise sd|N|rad|deg|mm|ms|m|s|kg|%)(?![A-Za-z])|(?<=N m) s(?![A-Za-z])"
@@ -94,6 +97,18 @@ def quantity(name: str, value: Estimate) -> tuple[str, str]:
     """Return a parameter's name and value, see `phrases.effects.quantity`."""
     title, text = _quantity(name, value)
     return title, signs(text)
+
+
+def own_number(name: str, value: Any, hinged: bool) -> str:
+    """Write a candidate's `<where>.<effect>.<parameter>`, with its unit where all joints are hinges."""
+    law, _, key = name.rpartition(".")
+    if isinstance(value, Mapping):
+        return f"{spelt(key)} {estimate(value.get('mean'), value.get('sd'), value.get('unit', ''))}"
+    if not finite(value) or abs(value) < TINY:
+        return f"{spelt(key)} {number(0 if finite(value) else value)}"
+    kind = library.known(law.rpartition(".")[2]) if hinged else None  # a slide's units are others
+    units = {q.name: q.unit for q in kind.quantities} if kind else {}
+    return " ".join(quantity(key, Estimate(float(value), math.nan, units.get(key, ""))))
 
 
 def not_fitted(d: Diagnosis, most: int | None = None) -> list[str]:

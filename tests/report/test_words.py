@@ -127,3 +127,18 @@ def test_the_ends_of_an_interval_of_shares_never_look_the_same():
 )
 def test_a_sentence_is_typeset_for_the_page(text, printed):
     assert words.page(text).replace("\N{NO-BREAK SPACE}", "_") == printed
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "hinged", "text"),
+    [
+        ("m1.actuator_delay.delay", 0.0396, True, "delay 39.6 ms"),
+        ("elbow.coulomb_friction.level", 0.15, True, "level 0.150 N m"),
+        ("rail.coulomb_friction.level", 30.0, False, "level 30.0"),
+        ("elbow.coulomb_friction.level", 1e-9, True, "level 0"),
+        ("m1.actuator_saturation.inverse_limit", 0.5, True, "limit 2.00 N m"),
+        ("elbow.my_effect.size", {"mean": 1.5, "sd": 0.1, "unit": "N"}, True, "size 1.50 ± 0.10 N"),
+    ],
+)
+def test_numbers_of_candidates_have_units_where_all_joints_are_hinges(name, value, hinged, text):
+    assert words.own_number(name, value, hinged) == text
