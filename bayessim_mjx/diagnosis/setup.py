@@ -163,7 +163,7 @@ def prepare(
     units = notes.inertial(checked.bases, [stand.measure(log, robot.mj_model) for log in usable])
     warnings = [*checked.notes, *units, *timed.notes, *timed.warnings, *untried, *cut.notes]
     warnings += [*uncompared, *few]
-    own = Settings(screened=24) if robot.mj_model.nv > CUTTING.many else Settings()
+    own = Settings(screened=CUTTING.shared(Settings.screened, int(robot.mj_model.nv)))
     settings = request.settings or (QUICK if request.quick else own)
     return Setup(
         robot=timed.robot,

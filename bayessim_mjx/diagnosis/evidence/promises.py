@@ -206,7 +206,8 @@ def around(weighing: Weighing, key: Key, say: Progress) -> list[Plan]:
     columns = leading(weighing, whole, own, hyper, columns)
     if key:
         labels = list(dict.fromkeys(c.candidate.label for c in columns))[: EFFORT.batch]
-        plans = [(c.candidate, c.point) for c in columns if c.candidate.label in labels]
+        again = (c for c in columns if c.candidate.label in labels)
+        plans = [(c.candidate, point) for c in again for point in state.secants.points(c)]
         own = looked_at(fit, state.settings.screened)
         columns = [
             *simulated(state.fitter, fit, plans, own, lambda _, done, total: say("screening again", done, total))

@@ -107,22 +107,29 @@ def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -
     r = model.residual(x, starts)
     A, linear = model.columns(x, starts, r), x  # where the derivatives are those of
     B = errors.columns(sigma)
-    gained, change = np.inf, np.full(model.size, np.inf)
+    noise = model.size / r.size  # share of the cost that as many columns take from noise of the residual's size
     damping = least = 1e-6  # share of the curvature, by Levenberg and Marquardt
-    while (gained > len(cut) or damping > least) and abs(x[0]) < 1 and np.abs(change).max() > STEP:
+    settled = False
+    while not settled and abs(x[0]) < 1:
         q, found = eliminate(r, A, B, errors.offsets + starts, cut.spread)
         g, S = q.weighted(np.ones(len(cut)))
         held = S + np.diag(precision + damping * np.diag(S))
         change = np.asarray(np.linalg.solve(held, g - precision * x), np.float64)
-        moved = x + change, starts + found.step(A, change)
-        there = model.residual(*moved)
-        gained = float(np.sum(r**2) - np.sum(there**2))
-        if gained > 0:
-            (x, starts), r, damping = moved, there, max(damping / 6, least)
+        turn = found.step(A, change)
+        there = model.residual(x + change, starts + turn)
+        cost, gained = float(np.sum(r**2)), float(np.sum(r**2) - np.sum(there**2))
+        if gained > 0:  # as much more damped as the columns promised too much (Nielsen, IMM-REP-1999-05, 1999)
+            predicted = r - np.einsum("wnk,k->wn", A, change) - np.einsum("wns,ws->wn", B, turn)
+            ratio = gained / max(cost - float(np.sum(predicted**2)), gained)
+            x, starts, r = x + change, starts + turn, there
+            damping = max(damping * max(1 / 6, 1 - (2 * ratio - 1) ** 3), least)
+            farthest = AROUND * (abs(float(x[0])) + SURE * abs(float(change[0])))
+            settled = gained < noise * cost or farthest < LEAST * cut.dt
         elif linear is not x:
-            (A, linear), gained = (model.columns(x, starts, r), x), np.inf
+            A, linear = model.columns(x, starts, r), x
         else:
-            damping, gained = 6 * damping, np.inf
+            damping *= 6
+            settled = float(np.abs(change).max()) < STEP
     if abs(x[0]) >= 1:
         return None
     return _judged(eliminate(r, A, B, errors.offsets + starts, cut.spread)[0], x, precision, cut, r.size - starts.size)

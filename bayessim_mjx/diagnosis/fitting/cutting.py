@@ -19,7 +19,7 @@ class Cutting:
     Attributes:
         window: s; shorter where contacts make it a lottery (`Discretisation.lottery`).
         limits: (up to so many dofs, windows).
-        budget: sub-steps of one simulation of all windows; half of it for robots of more than `many` dofs.
+        budget: sub-steps of one simulation of all windows; in proportion less for robots of more than `many` dofs.
         simulations: of all windows, that a whole search takes: where time is limited no finer integrator makes it take
             longer.
         fewest: windows that are simulated whatever the budget.
@@ -43,18 +43,22 @@ class Cutting:
         """Windows of a robot of so many degrees of freedom, whatever its time step."""
         return self.fewest if quick else next(n for dofs, n in self.limits if nv <= dofs)
 
+    def shared(self, effort: int, nv: int) -> int:
+        """Return an effort that is as much less as a robot has more than `many` degrees of freedom."""
+        return effort * min(self.many, nv) // nv
+
     def most(self, physics: Physics, length: int, quick: bool = False) -> int:
         """Most windows of so many control steps that are simulated at once."""
-        afforded = max(self.fewest, self._budget(physics) // (length * physics.substeps))
+        afforded = max(self.fewest, self.shared(self.budget, int(physics.mj_model.nv)) // (length * physics.substeps))
         return min(self.at_most(physics.mj_model.nv, quick), afforded)
 
     def finest(self, physics: Physics, count: int, length: int) -> int:
         """How many times the sub-steps the budget allows when at most half of `count` windows are given up for it."""
-        return max(1, self._budget(physics) // (length * physics.substeps * max(self.fewest, (count + 1) // 2)))
-
-    def _budget(self, physics: Physics) -> int:
-        """Sub-steps of one simulation of all windows."""
-        return self.budget if physics.mj_model.nv <= self.many else self.budget // 2
+        return max(
+            1,
+            self.shared(self.budget, int(physics.mj_model.nv))
+            // (length * physics.substeps * max(self.fewest, (count + 1) // 2)),
+        )
 
 
 CUTTING = Cutting()

@@ -94,9 +94,12 @@ def spanned(mean: float, low: float, high: float, unit: str) -> str:
 def quantity(name: str, value: Estimate) -> tuple[str, str]:
     """Return a parameter's name and value; reciprocals turned over (`inverse_limit` 0.5 1/(N m) -> limit 2 N m)."""
     if name in RECIPROCALS and finite(value.mean) and value.mean > 0:
-        sd = value.sd / value.mean**2 if finite(value.sd) else value.sd  # d(1/x) = dx / x^2
-        turned = {"at least": "at most", "at most": "at least"}.get(value.bound, value.bound)
-        return RECIPROCALS[name], _bounded(measured(1 / value.mean, sd, _turned(value.unit)), turned)
+        mean, sd, bound = value.mean, value.sd, value.bound
+        if finite(sd) and mean < CLEAR * sd:  # may be 0, and its reciprocal infinite
+            mean, sd, bound = mean + CLEAR * sd, None, "at most"
+        sd = sd / mean**2 if finite(sd) else sd  # d(1/x) = dx / x^2
+        turned = {"at least": "at most", "at most": "at least"}.get(bound, bound)
+        return RECIPROCALS[name], _bounded(measured(1 / mean, sd, _turned(value.unit)), turned)
     return spelt(name), _bounded(measured(value.mean, value.sd, value.unit), value.bound)
 
 

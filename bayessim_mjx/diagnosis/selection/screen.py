@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,6 +161,16 @@ class Secants:
     own: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, int))
     columns: dict[str, list[Column]] = field(default_factory=dict)
 
+    def add(self, columns: Iterable[Column]) -> None:
+        """Keep some more columns."""
+        for column in columns:
+            self.columns.setdefault(column.candidate.label, []).append(column)
+
+    def points(self, column: Column) -> list[Array]:
+        """Return where to simulate a candidate again: where it was, or also elsewhere if that was its middle alone."""
+        c = column.candidate
+        return [column.point] if len(self.columns[c.label]) > 1 else _spread(list(c.probes))[: EFFORT.points]
+
     def of(self, candidates: Iterable[Candidate]) -> list[Column]:
         """Return the columns of some candidates, in ranges as wide as they are by now."""
         return [replace(own, candidate=c) for c in candidates for own in self.columns.get(c.label, ())]
@@ -176,7 +187,9 @@ def screen(
 ) -> list[Screened]:
     """Rank all candidates on top of `fit`, best first, on at most `limit` windows.
 
-    Gains are scaled to all windows as if those looked at were typical: good for ranking, too high as an estimate.
+    Each is simulated at the middle one of its starting points. At the `Effort.batch` places where these gain most, all
+    candidates are simulated at all of them: something missing shows at its place in more than one law. Gains are
+    scaled to all windows as if those looked at were typical: good for ranking, too high as an estimate.
 
     Args:
         secants: what was simulated before; if empty, it is filled.
@@ -185,16 +198,18 @@ def screen(
     secants = Secants() if secants is None else secants
     if not secants.columns:
         secants.own = looked_at(fit, limit)
-        each = [[(c, point) for point in c.probes] for c in candidates]
-        turns = each if over is None else itertools.zip_longest(*map(_spread, each))
-        plans = [plan for turn in turns for plan in turn if plan]
-        for column in simulated(fitter, fit, plans, secants.own, say, over):
-            secants.columns.setdefault(column.candidate.label, []).append(column)
+        turns = list(itertools.zip_longest(*(_spread([(c, point) for point in c.probes]) for c in candidates)))
+        first = [plan for plan in turns[0] if plan] if turns else []
+        secants.add(simulated(fitter, fit, first, secants.own, say, over))
+        middle = [s for ((s, _),) in judged(fit, secants.of(candidates), secants.own).values()]
+        deep = list(dict.fromkeys(s.candidate.where for s in sorted(middle, key=lambda s: -s.gain)))[: EFFORT.batch]
+        more = [plan for turn in turns[1:] for plan in turn if plan and plan[0].where in deep]
+        secants.add(simulated(fitter, fit, more, secants.own, say, over, len(first)))
     found = judged(fit, secants.of(candidates), secants.own)
     return sorted(map(_with_others, found.values()), key=lambda s: -s.gain)
 
 
-def _spread(plans: Sequence[Plan]) -> list[Plan]:
+def _spread(plans: Sequence[Any]) -> list[Any]:
     """Order: the middle one first, then those halfway between, and so on: any number of them lies apart."""
     bits = len(plans).bit_length()
 
@@ -211,14 +226,19 @@ def simulated(
     own: NDArray[np.int64],
     say: Progress,
     over: Callable[[], bool] | None = None,
+    done: int = 0,
 ) -> Iterator[Column]:
-    """Return the changes by candidates at starting points of the residual of some windows `own`."""
+    """Return the changes by candidates at starting points of the residual of some windows `own`.
+
+    Args:
+        done: points that were simulated before, for what is said.
+    """
     some = part(fit, own)
     at_once = max(EFFORT.batch * fitter.simulator.lanes // len(own), 1)  # whole calls of the compiled program
     for first in range(0, len(plans), at_once):
-        if first and over is not None and over():
+        if done + first and over is not None and over():
             return
-        say("screening", first, len(plans))
+        say("screening", done + first, done + len(plans))
         now = plans[first : first + at_once]
         thetas = [
             fitter.vector((*fit.coordinates, *c.coordinates), np.concatenate([fit.values, point])) for c, point in now
