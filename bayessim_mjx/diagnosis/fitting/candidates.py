@@ -141,7 +141,8 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
     """One Effect per kind over all of its places, each with values and ranges of its own; and what is left out."""
     made, without = [], dict[str, list[str]]()
     for kind in kinds:
-        found = tuple(p for p in places(kind, scales.model) if _alive(kind, p, scales))
+        every = places(kind, scales.model)
+        found = tuple(p for p in every if _alive(kind, p, scales))
         own, whys = dict[str, tuple[Parameter, ...]](), list[str]()
         for place in found:
             try:
@@ -157,7 +158,7 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
             except UserError as error:
                 whys.append(str(error))
         why = whys[0].removeprefix(f"{kind.name}: ") if found else f"these logs excite no suitable {kind.kind}"
-        if found or not kind.floats:
+        if found or (every and not kind.floats):
             without.setdefault(why, []).append(kind.name)
     names = [scales.model.joint(int(j)).name for j in scales.model.dof_jntid]
     pairs = [(names[i], names[k]) for i, k in scales.follows.items()]

@@ -140,15 +140,12 @@ def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, lef
     stable = coarsest_stable(own.mj_model, logs, precise)
     better = stable.robot(robot)
     cuts, worth = measured(better.physics(dt, gains), first=stable.factor)
-    if not stable.changed or stable.integrator != RK4:
+    more = stable.changed and stable.integrator == RK4
+    if not more or worth.errors is None or worth.errors.seconds < left:
         return Choice(better, stable, cuts, worth)
-    if worth.errors and worth.errors.seconds >= left:
-        stable = coarsest_stable(own.mj_model, logs)
-        robot = stable.robot(robot)
-        return Choice(robot, stable, *measured(robot.physics(dt, gains), first=stable.factor), better=(TOO_LONG,))
-    step = 1e3 * worth.timestep / worth.factor
-    text = f"the diagnosis simulates by RK4 at {step:.3g} ms: errors of the model's integrator could pass for effects"
-    return Choice(better, stable, cuts, worth, better=(text,))
+    stable = coarsest_stable(own.mj_model, logs)
+    robot = stable.robot(robot)
+    return Choice(robot, stable, *measured(robot.physics(dt, gains), first=stable.factor), better=(TOO_LONG,))
 
 
 @dataclass(frozen=True)

@@ -230,7 +230,7 @@ def test_where_nothing_touches_the_integrator_is_runge_and_kuttas(noise):
     """A tolerance of a fiftieth of the noise: 3e-6 rad of a swing of two radians."""
     found, tried = chosen(logs(ARM, swing, noise=noise), 0.02 * noise)
     assert tried == [mujoco.mjtIntegrator.mjINT_RK4] == [found.robot.mj_model.opt.integrator]
-    assert not found.worth.beyond() and "by RK4 at 5 ms" in found.said()[0]
+    assert not found.said()
     assert found.worth.believed > 0.9
 
 
