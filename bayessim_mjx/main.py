@@ -50,6 +50,9 @@ class Watched:
             step, tree = loop.checkpoint_step(self.parts, round_, state.train), loop.tree_of(self.parts, state)
             self.save(step, tree, meta=loop.meta_of(state))
 
+    def part(self, round_: int, name: str) -> None:
+        self.session.part(round_, name)
+
     def round(self, info: Any, policy: Any) -> None:
         self.session.round(info, policy)  # no stop here: the round is not saved yet
 
@@ -101,13 +104,17 @@ def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
 
 def _run(config: Config, run: Any, device: Any, command: Sequence[str], console: Any) -> int:
     from bayessim_mjx import loop, registry, runs
-    from bayessim_mjx.monitor.console import opening
+    from bayessim_mjx.monitor.clock import CompileClock
+    from bayessim_mjx.monitor.opening import opening
 
     env = registry.make(config.task, config=config)
     console.start(opening(config, env, device))
-    console.phase("setting up")
+    console.phase("compiling the training")
+    compiling = CompileClock()
     parts = loop.make(config, env)
+    config = parts.config  # with the surrogate's parameters: the run keeps them
     state, resumed_at = _state(parts, run, console)
+    compiling.report(console, "the training")
     if run is None:
         run = runs.Run.create(config.logdir, config.task, config.name, config, command)
     else:
