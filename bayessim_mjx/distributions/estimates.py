@@ -53,7 +53,7 @@ class Estimates:
         """State in words how much of the prior is kept; "" where nothing is."""
         if self.prior_share >= PRIOR_ITSELF:
             return f"these are numbers of the prior: {percent(self.prior_share)} of the posterior is the prior"
-        kept = f"{percent(self.prior_share)} of the prior is kept beside these numbers: no training excludes the truth"
+        kept = f"training also draws {percent(self.prior_share)} of its physics from the prior: it excludes no truth"
         return kept if self.prior_share > 0 else ""
 
     def pick(self, index: Sequence[int] | np.ndarray) -> Estimates:
