@@ -73,8 +73,8 @@ class CompileClock:
             return
         self.backend += duration_secs if event == BACKEND else 0.0
         begun, end = self.now() - duration_secs, self.now()
-        while self.spans and self.spans[-1][0] >= begun:  # what this one contains: a program traced inside another
-            self.spans.pop()
+        while self.spans and self.spans[-1][1] > begun:  # a program traced inside another, or compiled beside it
+            begun = min(begun, self.spans.pop()[0])
         self.spans.append((begun, end))
 
     def take(self) -> tuple[float, bool]:

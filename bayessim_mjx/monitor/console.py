@@ -151,6 +151,8 @@ class Console:
             where += f" {int(at)}"
         if self._bars is not None and "phase" in self._bars:
             self._bars.move("phase", done, fit(numbers, self._bars.note_room(), "  ", count=False), eta)
+            if self._steps is not None and self._steps.done >= self._steps.total:  # the bar goes: its numbers stay
+                self._out.facts([where, *numbers], "")
             return
         ahead = f"  ETA {duration(eta)}" if eta else ""
         self._out.say(f"{where}  " + fit(numbers, self.width - len(where) - len(ahead) - 2, "  ", count=False) + ahead)

@@ -208,13 +208,10 @@ def _coverage(axes: Any, report: Any) -> None:
     axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="probability of the region", ylabel="share of true parameters inside")
     axes.set_title("coverage: below the band the posterior is too narrow, above too wide", fontsize=9, loc="left")
     axes.legend(loc="upper left", frameon=False, fontsize=8)
-    blocks = [*list(report.interval_coverage().items())[:1], ("HPD coverage", report.coverage)]
-    text = "\n\n".join("\n".join([shorten([what], 30)[0], *_rows(shares)]) for what, shares in blocks)
+    what, shares = next(iter(report.interval_coverage().items()), ("HPD coverage", report.coverage))
+    rows = [f"{percent(level)}:  {percent_estimate(share, error, 1)}" for level, (share, error) in shares.items()]
+    text = "\n".join([shorten([what], 36)[0], *rows])
     axes.text(0.97, 0.03, text, ha="right", va="bottom", fontsize=8, linespacing=1.4, transform=axes.transAxes)
-
-
-def _rows(shares: Mapping[float, tuple[float, float]]) -> list[str]:
-    return [f"{percent(level)}:  {percent_estimate(share, error, 1)}" for level, (share, error) in shares.items()]
 
 
 def _sets(axes: Any, sets: Any) -> None:
