@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
-from bayessim_mjx import cli
+from bayessim_mjx import cli, trust
 from bayessim_mjx.cli import commands
 from bayessim_mjx.config import Config, to_yaml
 from bayessim_mjx.device import setup_jax
@@ -127,7 +127,7 @@ def _run(config: Config, run: Any, device: Any, command: Sequence[str], console:
             state = _rounds(parts, state, run, console, resumed_at)
         _report(console, parts, state)
     which = "best" if run.manifest["best"] is not None else "latest"
-    console.command(f"{which} policy", f"{cli.prog_of('play')} --checkpoint {run.path} --video")
+    console.command(f"{which} policy", f"{cli.prog_of('play')} --checkpoint {run.path}{trust.flags()} --video")
     console.command("pictures", f"tensorboard --logdir {run.path} --samples_per_plugin images=1000")
     return 0
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx import cli
+from bayessim_mjx import cli, trust
 from bayessim_mjx.config import Config, to_yaml
 from bayessim_mjx.config.settings import AGENTS
 from bayessim_mjx.device import mesh, setup_jax
@@ -264,7 +264,7 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
                 finally:
                     training.close()
         which = "latest" if run.manifest["best"] is None else f"best (step {run.manifest['best']})"
-        console.command(f"{which} policy", f"{cli.prog_of('play')} --checkpoint {run.path} --video")
+        console.command(f"{which} policy", f"{cli.prog_of('play')} --checkpoint {run.path}{trust.flags()} --video")
         console.command("curves", f"tensorboard --logdir {run.path}")
     return 0
 
