@@ -137,7 +137,7 @@ def _state(parts: Any, run: Any, console: Any) -> tuple[Any, int | None]:
     from bayessim_mjx import loop
     from bayessim_mjx.monitor.writers import marked
 
-    state = loop.init(parts)
+    state = loop.init(parts, progress=False)  # the console shows it
     if run is not None and run.checkpoints:
         tree, meta = run.restore("latest", loop.tree_of(parts, state), fall_back=True)
         return tree["state"], marked(meta)

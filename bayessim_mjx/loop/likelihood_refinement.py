@@ -47,7 +47,7 @@ def refine_by_replays(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
         warnings.append(f"bayessim.refine: {_without_noise(likelihood.silent, likelihood.physics.mj_model)}")
     if not likelihood.seen.any():
         return answer, Evidence(warnings=warnings)
-    round_.begin("replaying the real trajectories")
+    round_.begin("replaying the real motion")
     seed = int(jax.random.randint(branch(loop.key(round_.number, "fit"), 3), (), 0, 2**31 - 1))
     found = refine(answer.posterior, likelihood, seed=seed, components=b.components)
     seconds = {"refine": time.perf_counter() - clock}

@@ -87,13 +87,17 @@ def make(config: Config, env: Env) -> Loop:
     return Loop(env, config, source, len(names), names)
 
 
-def init(loop: Loop, trains: bool = True) -> LoopState:
+def init(loop: Loop, trains: bool = True, progress: bool | None = None) -> LoopState:
     """Make the state before round 0: an untrained policy, the prior as domain, no data.
 
-    trains: whether training comes next, its program then being compiled beside the first reset's.
+    Args:
+        trains: whether training comes next, its program then being compiled beside the first reset's.
+        progress: as `run` takes it.
     """
     fields = blank(loop)
-    policy = _new_policy(loop, 0, fields["domain"], rl.start if trains else rl.init)
+    with shown(progress) as show:
+        show("compiling the training" if trains else "setting up", 0, 1)
+        policy = _new_policy(loop, 0, fields["domain"], rl.start if trains else rl.init)
     return LoopState(round=jnp.int32(0), train=policy, **fields)
 
 

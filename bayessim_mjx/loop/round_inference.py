@@ -61,7 +61,7 @@ def infer(loop: Loop, state: LoopState, policy: Policy, begin: Begin = UNWATCHED
     state, simulations, spent = simulate(loop, state, policy)
     state, real = observe(loop, state, policy)
     state, learnt, trained = learn(loop, state, simulations, begin)
-    begin("conditioning on the real trajectories")
+    begin("conditioning on real motion")
     state, answer, combined = condition(loop, state)
     round_, found = Round(loop, state, policy, real, learnt, begin), [spent, trained, combined]
     for correct in CORRECTIONS:

@@ -76,7 +76,7 @@ def test_a_monitor_takes_the_place_of_progress(capsys: Any, monkeypatch: pytest.
 
     monkeypatch.setattr(progress, "watched", lambda: True)
     monitor, parts = Monitor(), loop.make(settings(), TOY)
-    loop.run(parts, loop.init(parts), monitor=monitor)
+    loop.run(parts, loop.init(parts, progress=False), monitor=monitor)
     assert monitor.rounds == 1 and capsys.readouterr() == ("", "")
-    loop.run(parts, loop.init(parts), monitor=(listener := Listener()))
+    loop.run(parts, loop.init(parts, progress=False), monitor=(listener := Listener()))
     assert listener.parts == ((0, "evaluating the policy"),)
