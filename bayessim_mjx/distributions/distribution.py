@@ -285,11 +285,12 @@ class Distribution:
         prior_sd = np.asarray(evaluate.prior_points(self.space), np.float64).std(0)
         return estimates(points, prior_sd, weights, float(self.prior_weight))
 
-    def describe(self) -> dict[str, dict[str, float]]:
-        """Per parameter name: median, q16 and q84 (ends of the 68 % interval), mean, sd, contraction, and the box.
+    def summary(self) -> str:
+        """Write a line for each parameter: median and 68 % interval, posterior over prior standard deviation."""
+        return self.estimates().lines(self.names, self.space.units)
 
-        Of what was inferred, see `estimates`; the share of the prior that is kept beside is `prior_weight`.
-        """
+    def describe(self) -> dict[str, dict[str, float]]:
+        """Per parameter name: numbers of `estimates` (q16 to q84 is the 68 % interval), contraction, and the box."""
         e = self.estimates()
         rows = e.median, e.low, e.high, e.mean, e.sd, e.contraction, self.space.low, self.space.high
         keys = ("median", "q16", "q84", "mean", "sd", "contraction", "low", "high")
