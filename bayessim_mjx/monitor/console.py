@@ -167,6 +167,7 @@ class Console:
         gain: float | None = None,
         widths: Mapping[str, float] | None = None,
         seconds: float | None = None,
+        ends: bool = False,
     ) -> None:
         """One line for a finished round; what is None is left out.
 
@@ -175,6 +176,7 @@ class Console:
             reward: mean (and standard deviation) of the return on the real system, or `where` it was measured.
             gain: log posterior - log prior at the truth [nats].
             widths: {parameter: posterior sd / prior sd}, in the order of interest: as many as fit are shown.
+            ends: whether no further round follows.
         """
         if self._rounds is not None:
             self._rounds.advance(int(round) + 1)
@@ -184,7 +186,7 @@ class Console:
             parts.append(f"{where} return {estimate(*reward) if isinstance(reward, Sequence) else compact(reward)}")
         if gain is not None and is_number(gain):
             parts.append(f"log density at the truth {float(gain):+.2f} nats over the prior")
-        eta = self._rounds.eta() if self._rounds is not None else None
+        eta = self._rounds.eta() if self._rounds is not None and not ends else None
         tail = [] if seconds is None else [duration(float(seconds))]
         tail += [f"ETA {self._most}{duration(eta)}"] if eta else []
         if widths:

@@ -288,4 +288,5 @@ def round_line(info: RoundInfo) -> dict[str, Any]:
         "gain": info.scores.get("gain_over_prior"),
         "widths": widths,
         "seconds": sum(info.seconds.values()),
+        "ends": bool(info.settled),
     }

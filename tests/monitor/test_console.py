@@ -205,6 +205,8 @@ def test_a_part_without_lines_says_that_it_still_runs():
     assert file.getvalue().splitlines()[3:] == ["a line"]
     console.round_line(round=0)
     assert "ETA at most 8 min 40 s" in file.getvalue()
+    console.round_line(round=1, ends=True)
+    assert file.getvalue().splitlines()[-1] == "round 2/5"
 
 
 def test_a_bar_counts_the_time_to_go_down_and_shows_the_time_so_far_without_one(monkeypatch):
