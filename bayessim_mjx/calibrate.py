@@ -63,7 +63,7 @@ def _calibrate(argv: Sequence[str] | None) -> int:
     from bayessim_mjx.monitor.console import Console
 
     parts = loop.make(config, registry.make(config.task, config=config))
-    tree, _ = run.restore(args.checkpoint, loop.tree_of(parts, loop.init(parts, trains=False)))
+    tree, _ = run.restore(args.checkpoint, loop.tree_of(parts, loop.init(parts, trains=False, progress=False)))
     if int(tree["state"].round) < 1:
         raise UserError(f"--run {args.run}: no round of it is finished, there is no posterior yet")
     with Console(headless=True) as console:

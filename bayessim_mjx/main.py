@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
-from bayessim_mjx import cli
+from bayessim_mjx import cli, trust
 from bayessim_mjx.cli import commands
 from bayessim_mjx.config import Config, to_yaml
 from bayessim_mjx.device import setup_jax
@@ -49,6 +49,9 @@ class Watched:
         if self.stop.requested:
             step, tree = loop.checkpoint_step(self.parts, round_, state.train), loop.tree_of(self.parts, state)
             self.save(step, tree, meta=loop.meta_of(state))
+
+    def part(self, round_: int, name: str) -> None:
+        self.session.part(round_, name)
 
     def round(self, info: Any, policy: Any) -> None:
         self.session.round(info, policy)  # no stop here: the round is not saved yet
@@ -101,13 +104,17 @@ def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
 
 def _run(config: Config, run: Any, device: Any, command: Sequence[str], console: Any) -> int:
     from bayessim_mjx import loop, registry, runs
-    from bayessim_mjx.monitor.console import opening
+    from bayessim_mjx.monitor.clock import CompileClock
+    from bayessim_mjx.monitor.opening import opening
 
     env = registry.make(config.task, config=config)
     console.start(opening(config, env, device))
-    console.phase("setting up")
+    console.phase("compiling the training")
+    compiling = CompileClock()
     parts = loop.make(config, env)
+    config = parts.config  # with the surrogate's parameters: the run keeps them
     state, resumed_at = _state(parts, run, console)
+    compiling.report(console, "the training")
     if run is None:
         run = runs.Run.create(config.logdir, config.task, config.name, config, command)
     else:
@@ -120,7 +127,7 @@ def _run(config: Config, run: Any, device: Any, command: Sequence[str], console:
             state = _rounds(parts, state, run, console, resumed_at)
         _report(console, parts, state)
     which = "best" if run.manifest["best"] is not None else "latest"
-    console.command(f"{which} policy", f"{cli.prog_of('play')} --checkpoint {run.path} --video")
+    console.command(f"{which} policy", f"{cli.prog_of('play')} --checkpoint {run.path}{trust.flags()} --video")
     console.command("pictures", f"tensorboard --logdir {run.path} --samples_per_plugin images=1000")
     return 0
 
@@ -130,7 +137,7 @@ def _state(parts: Any, run: Any, console: Any) -> tuple[Any, int | None]:
     from bayessim_mjx import loop
     from bayessim_mjx.monitor.writers import marked
 
-    state = loop.init(parts)
+    state = loop.init(parts, progress=False)  # the console shows it
     if run is not None and run.checkpoints:
         tree, meta = run.restore("latest", loop.tree_of(parts, state), fall_back=True)
         return tree["state"], marked(meta)

@@ -15,7 +15,9 @@ from bayessim_mjx.quantities import duration
 
 EVERY = 10.0  # s between two lines of one stage
 BEAT = 30.0  # s without a line, such as while a program is compiled, after which one says that the stage still runs
-BESIDE = 52  # columns of a terminal that a bar, its count and its two times take
+BESIDE = 32  # columns of a terminal that a count and two times take beside a bar
+WIDE = 100  # columns of a terminal that has room for long bars
+ENDED = 8  # stages that stay on a terminal after their end; more would push the one that runs out of it
 
 
 @runtime_checkable
@@ -105,12 +107,15 @@ class Bars:
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
         if stage not in self.stages:
-            for other in (k for k in self.stages.values() if not self.bars.tasks[k].finished):
-                known = self.bars.tasks[other].total
+            for other in [task for task in self.bars.tasks if not task.finished]:
+                known = other.total
                 whole = {"count": f"{known:.0f}/{known:.0f}"} if known else {}
-                self.bars.update(other, completed=known or 1, total=known or 1, **whole)
+                self.bars.update(other.id, completed=known or 1, total=known or 1, **whole)
             self.stages[stage] = self.bars.add_task(stage, total=None, count="")
-        shown, room = f"{stage}, {note}" if note else stage, max(self.bars.console.width - BESIDE, 20)
+            for old in list(self.stages)[: -ENDED - 1]:
+                self.bars.remove_task(self.stages.pop(old))
+        room = max(self.bars.console.width - BESIDE - _bar(self.bars.console), 20)
+        shown = f"{stage}, {note}" if note else stage
         shown = shown if len(shown) <= room else f"{shown[: room - 1]}…"
         many = total > 1  # a stage of one part has no share that is done: its bar moves from side to side
         count = dict(completed=done, total=total, count=f"{done}/{total}") if many else dict(total=None, count="")
@@ -118,6 +123,11 @@ class Bars:
 
     def line(self, text: str) -> None:
         self.bars.console.print(text, highlight=False, markup=False)
+
+
+def _bar(console: Any) -> int:
+    """Choose the columns of a bar."""
+    return 20 if console.width >= WIDE else 10
 
 
 @contextlib.contextmanager
@@ -157,8 +167,9 @@ def stages(headless: bool) -> Iterator[Show]:
     )
 
     words, count = (TextColumn(field, markup=False) for field in ("{task.description}", "{task.fields[count]}"))
-    columns = (SpinnerColumn(), words, BarColumn(20), count, TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True, console=Console(stderr=True)) as bars:
+    console = Console(stderr=True)
+    columns = (SpinnerColumn(), words, BarColumn(_bar(console)), count, TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True, console=console) as bars:
         yield Bars(bars)
 
 

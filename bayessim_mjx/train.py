@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx import cli
+from bayessim_mjx import cli, trust
 from bayessim_mjx.config import Config, to_yaml
 from bayessim_mjx.config.settings import AGENTS
 from bayessim_mjx.device import mesh, setup_jax
@@ -19,7 +19,7 @@ from bayessim_mjx.quantities import estimate
 
 DESCRIPTION = "Train a policy with PPO alone, on nominal physics or on physics drawn from the prior or a posterior."
 
-SPEED, WORTH_SAYING = "Perf/total_fps", 0.5  # seconds of compilation
+SPEED = "Perf/total_fps"
 SHOWN = (
     "Train/mean_reward",
     "Train/mean_episode_length",
@@ -103,9 +103,7 @@ class Training:
     def progress(self, metrics: dict[str, Any], state: Any) -> None:
         iteration = int(state.iteration)
         self.writer.scalars(iteration, {tag if "/" in tag else f"Perf/{tag}": v for tag, v in metrics.items()})
-        seconds, cached = self.compiling.take()
-        if slowed := seconds > WORTH_SAYING:
-            self.console.compile("training", seconds, cached)
+        slowed = self.compiling.report(self.console, "the training")
         shown = {tag: metrics[tag] for tag in SHOWN if tag in metrics and not (slowed and tag == SPEED)}
         self.wall.scalars(metrics)
         self.console.iteration(shown, iteration)
@@ -151,9 +149,7 @@ class Training:
         score = float(result["return"].mean())
         figures = {"Eval/mean_reward": score, "Eval/mean_episode_length": float(result["length"].mean())}
         self.writer.scalars(int(state.iteration), figures)
-        seconds, cached = self.compiling.take()
-        if seconds > WORTH_SAYING:
-            self.console.compile("evaluation", seconds, cached)
+        self.compiling.report(self.console, "the evaluation")
         found = estimate(score, result["return"].std())
         self.console.say(f"evaluation at {int(state.iteration)}: return {found} over {count} episodes")
         return score
@@ -233,7 +229,8 @@ class AgentTraining(Training):
 
 def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> int:
     from bayessim_mjx import registry, runs
-    from bayessim_mjx.monitor.console import Console, opening
+    from bayessim_mjx.monitor.console import Console
+    from bayessim_mjx.monitor.opening import opening
 
     device = setup_jax(config)
     mesh(config)  # refuse before there is a run folder
@@ -253,7 +250,9 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
         console.say(f"run folder {run.path}")
         with cli.running(run, console.say):
             training = (Training if config.agent == "own" else AgentTraining)(config, env, run, console, stop)
+            console.phase("compiling the training")
             state, resumed_at = training.state(resume)
+            training.compiling.report(console, "the training")
             done = int(state.iteration)
             if done >= config.ppo.max_iterations and not training.owes_evaluation(done):
                 console.say("this run had finished; --max_iterations N goes on with it, to N iterations in all")
@@ -265,7 +264,7 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
                 finally:
                     training.close()
         which = "latest" if run.manifest["best"] is None else f"best (step {run.manifest['best']})"
-        console.command(f"{which} policy", f"{cli.prog_of('play')} --checkpoint {run.path} --video")
+        console.command(f"{which} policy", f"{cli.prog_of('play')} --checkpoint {run.path}{trust.flags()} --video")
         console.command("curves", f"tensorboard --logdir {run.path}")
     return 0
 

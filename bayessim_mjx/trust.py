@@ -5,6 +5,7 @@ Settings files, run folders, effects.yaml and diagnosis.json may come from anybo
 
 import functools
 import os
+import shlex
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,6 +20,11 @@ _named: set[Path] = set()
 def allow(files: Iterable[str | os.PathLike]) -> None:
     """Files whose code may run in this process, whoever names them."""
     _named.update(Path(file).expanduser().resolve() for file in files)
+
+
+def flags() -> str:
+    """Write flags that allow the same files in another command: " --allow_code reach.py"; "" for none."""
+    return "".join(f" {FLAG} {shlex.quote(str(file))}" for file in sorted(_named))
 
 
 def check(file: Path, spec: str, what: str = "effect") -> None:

@@ -65,13 +65,13 @@ def of_run(task: str, folder: Path) -> tuple[film.Motion, Any, str]:
     assert run is not None
     env: Any = registry.make(task, config=run.config)
     shown = _acting(env, cli.load_policy(path, env, run.config))
-    return shown, env.mj_model, f"a policy after {int(path.name)} updates of PPO"
+    return shown, env.mj_model, f"{int(path.name)} updates of PPO"
 
 
 def of_package(task: str) -> tuple[film.Motion, Any, str]:
     """(motion, model, what it shows) of the policy that comes with the package."""
     env: Any = registry.make(task, config=load(task))
-    return _acting(env, pretrained.pretrained(task)), env.mj_model, "the policy that comes with the package"
+    return _acting(env, pretrained.pretrained(task)), env.mj_model, "the package's policy"
 
 
 def _acting(env: Any, policy: Any) -> film.Motion:

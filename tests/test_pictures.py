@@ -4,7 +4,9 @@ import html
 import re
 from pathlib import Path
 
+from bayessim_mjx import config, registry
 from bayessim_mjx.diagnosis.phrases import verdict
+from bayessim_mjx.monitor.opening import opening
 
 ROOT = Path(__file__).parents[1]
 # in the places of templates: numbers, names, forms of words
@@ -35,6 +37,11 @@ def test_pictures_of_the_terminal_are_of_the_commands_and_words_of_today():
     first = re.search(r"-m bayessim_mjx\.(main --task \w+)", (ROOT / "README.md").read_text())
     loop = lines_of("loop.svg")
     assert first is not None and f"bayessim-mjx {first[1]}" in loop
+    settings = config.load("Pendulum")
+    lines = opening(settings, registry.make("Pendulum", config=settings), "cpu:0")
+    texts = {key: ", ".join(text) if isinstance(text, list) else str(text) for key, text in lines.items()}
+    begins = [f"{key:<10}  {text}" for key, text in texts.items() if key not in ("device", "note")]
+    assert len(begins) > 5 and [line for line in begins if line not in loop] == []
     rows = re.findall(r"^\| `(posterior: refined[^`]*)`", (ROOT / "docs" / "first_run.md").read_text(), re.M)
     (refined,) = (re.compile(re.sub(r"\d+", r"\\d+", row)) for row in rows)
     assert any(refined.fullmatch(line) for line in loop) and any(line.startswith("settled: ") for line in loop)

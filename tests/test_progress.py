@@ -141,3 +141,14 @@ def test_a_stage_that_has_ended_is_whole(monkeypatch):
         whole = [task.finished for task in show.bars.tasks]
     assert counts == {"compiling": "", "screening": "67/67", "single effects": "3/3", "screening again": "0/3"}
     assert whole == [True, True, True, False]
+
+
+def test_stages_that_ended_long_ago_leave_the_terminal(monkeypatch):
+    """A loop of many rounds has more parts than a terminal has lines: the one that runs would be cut off."""
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("TERM", "xterm")
+    with progress.stages(headless=False) as show:
+        for part in range(40):
+            show(f"part {part}", 0, 1)
+        names = [task.description for task in show.bars.tasks]
+    assert names == [f"part {k}" for k in range(40 - 1 - progress.ENDED, 40)]

@@ -148,3 +148,11 @@ def test_values_of_overrides_are_one_value() -> None:
     with pytest.raises(UserError, match=r"expected section\.key=value"):
         load("Pendulum", overrides=[".".join("a" * 3000) + "=1"])
     assert config.load("Pendulum", overrides=["name=a-1"]).name == "a-1"
+
+
+def test_allowed_files_are_flags_for_the_next_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run of one's own task ends with a command that plays its policy: without the flag it would be refused."""
+    monkeypatch.setattr(trust, "_named", set())
+    assert trust.flags() == ""
+    trust.allow([tmp_path / "my arm.py", tmp_path / "effect.py"])
+    assert trust.flags() == f" --allow_code {tmp_path}/effect.py --allow_code '{tmp_path}/my arm.py'"

@@ -22,7 +22,6 @@ from bayessim_mjx.rl import Policy
 from bayessim_mjx.runs import checkpoints
 
 SHOWN = ("Train/mean_reward", "Perf/total_fps")
-WORTH_SAYING = 0.5  # s of compilation
 Policies = dict[int, Policy]  # by PPO iteration
 
 
@@ -78,9 +77,7 @@ class Keeper:
 
             def progress(metrics: dict[str, Any], state: Any) -> None:
                 writer.scalars(int(state.iteration), {k: v for k, v in metrics.items() if "/" in k})
-                seconds, cached = self.clock.take()
-                if seconds > WORTH_SAYING:
-                    console.compile("training", seconds, cached)
+                self.clock.report(console, "the training")
                 console.iteration({k: metrics[k] for k in SHOWN}, int(state.iteration))
 
             def keep(mark: int, policy: Policy) -> None:

@@ -218,7 +218,9 @@ class EnvConfig(Section):
     SECTION: typing.ClassVar[str] = "env"
     numEnvs: int = setting(256, "worlds simulated in parallel; the same number as ppo.num_envs", low=1, high=COUNT)
     episodeLength: int | None = setting(None, "control steps per episode; null: the task's own", low=1, high=COUNT)
-    realParams: Frozen | None = setting(None, "surrogate real: {weights, means, stds}, rows or {name: value}")
+    realParams: Frozen | None = setting(
+        None, "surrogate real: {weights, means, stds}, rows or {name: value}; null: the seed draws"
+    )
     impl: str = setting(
         "jax", "what computes the physics: jax, warp (needs warp-lang), or auto", choices=IMPLEMENTATIONS
     )

@@ -15,7 +15,6 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from bayessim_mjx.distributions import algebra, charts, convert, evaluate, storage
-from bayessim_mjx.distributions.description import Description
 from bayessim_mjx.distributions.estimates import PRIOR_ITSELF, Estimates, estimates
 
 if TYPE_CHECKING:
@@ -286,15 +285,15 @@ class Distribution:
         prior_sd = np.asarray(evaluate.prior_points(self.space), np.float64).std(0)
         return estimates(points, prior_sd, weights, float(self.prior_weight))
 
-    def describe(self) -> Description:
-        """Per parameter name: median, q16 and q84 (ends of the 68 % interval), mean, sd, contraction, and the box.
+    def summary(self) -> str:
+        """Write a line for each parameter: median and 68 % interval, posterior over prior standard deviation."""
+        return self.estimates().lines(self.names, self.space.units)
 
-        It prints as a table. Of what was inferred, see `estimates`; the share of the prior beside it is `prior_weight`.
-        """
+    def describe(self) -> dict[str, dict[str, float]]:
+        """Per parameter name: numbers of `estimates` (q16 to q84 is the 68 % interval), contraction, and the box."""
         e = self.estimates()
         rows = e.median, e.low, e.high, e.mean, e.sd, e.contraction, self.space.low, self.space.high
         keys = ("median", "q16", "q84", "mean", "sd", "contraction", "low", "high")
-        return Description(
-            (name, {key: float(row[i]) for key, row in zip(keys, rows, strict=True)})
-            for i, name in enumerate(self.names)
-        )
+        return {
+            name: {key: float(row[i]) for key, row in zip(keys, rows, strict=True)} for i, name in enumerate(self.names)
+        }

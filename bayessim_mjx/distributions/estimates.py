@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayessim_mjx.quantities import percent
+from bayessim_mjx.quantities import percent, spread
 
 PRIOR_ITSELF = 0.5  # share of the prior from which on a posterior counts as the prior: most of its draws are
 TAIL = 0.15865525393145707  # of a Gaussian beyond one standard deviation: between both tails lie 68 %
@@ -53,8 +53,16 @@ class Estimates:
         """State in words how much of the prior is kept; "" where nothing is."""
         if self.prior_share >= PRIOR_ITSELF:
             return f"these are numbers of the prior: {percent(self.prior_share)} of the posterior is the prior"
-        kept = f"{percent(self.prior_share)} of the prior is kept beside these numbers: no training excludes the truth"
+        kept = f"training also draws {percent(self.prior_share)} of its physics from the prior: it excludes no truth"
         return kept if self.prior_share > 0 else ""
+
+    def lines(self, names: Sequence[str], units: Sequence[str]) -> str:
+        """Write `mass  1.04 ± 0.06 kg  posterior/prior sd 0.1` for each parameter."""
+        rows = zip(self.median, self.low, self.high, self.sd, units, strict=True)
+        found = [f"{spread(*row[:4])} {row[4]}".rstrip() for row in rows]
+        wide, long = max(map(len, names), default=0), max(map(len, found), default=0)
+        each = zip(names, found, self.width, strict=True)
+        return "\n".join(f"{n:<{wide}}  {text:<{long}}  posterior/prior sd {w:.2g}" for n, text, w in each)
 
     def pick(self, index: Sequence[int] | np.ndarray) -> Estimates:
         """Those of some parameters, in the order of `index`."""

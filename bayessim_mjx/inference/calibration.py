@@ -21,7 +21,7 @@ from bayessim_mjx.compat import brief
 from bayessim_mjx.distributions import Distribution, box
 from bayessim_mjx.distributions.evaluate import candidates
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.inference.numbers import ALPHA, DRAWS, FEW
+from bayessim_mjx.inference.numbers import ALPHA, DRAWS, FEW, NEGLIGIBLE
 from bayessim_mjx.inference.temperature import LEVELS, TEMPERATURES, temperature, widened
 from bayessim_mjx.keys import branch
 from bayessim_mjx.quantities import MOST, listed, percent, percent_estimate
@@ -118,13 +118,25 @@ class Report:
         """
         if not self.widths:
             return _covered("HPD coverage", self.coverage)
-        pit = np.asarray(self.ranks.parameters, np.float64)
-        n, away = self.pairs, 2 * np.abs(pit - 0.5)
-        own = {
-            i: {a: (float(np.mean(away[:, i] <= a)), float(np.sqrt(a * (1 - a) / n))) for a in LEVELS}
-            for i in self.widths[:MOST]
+        return "; ".join(_covered(what, shares) for what, shares in self.interval_coverage().items())
+
+    def intervals(self) -> dict[str, np.ndarray]:
+        """Masses [n] of the smallest central intervals that hold the truths, of parameters with a wrong width."""
+        away = 2 * np.abs(np.asarray(self.ranks.parameters, np.float64) - 0.5)
+        return {self.names[i]: away[:, i] for i in self.widths[:MOST]}
+
+    def interval_coverage(self) -> dict[str, dict[float, tuple[float, float]]]:
+        """Count these intervals: {what: {nominal level: (share of truths inside, standard error)}}."""
+        error = {a: float(np.sqrt(a * (1 - a) / self.pairs)) for a in LEVELS}
+        return {
+            f"intervals of {name}": {a: (float(np.mean(masses <= a)), error[a]) for a in LEVELS}
+            for name, masses in self.intervals().items()
         }
-        return "; ".join(_covered(f"intervals of {self.names[i]}", shares) for i, shares in own.items())
+
+    @property
+    def limit(self) -> float:
+        """p-value of ranks below which they are a fault: all tests together find one by chance in ALPHA of cases."""
+        return ALPHA / 4 / len(self.p)  # see `_verdict`
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
@@ -186,7 +198,8 @@ def _verdict(
 
     Each of four families of tests has a quarter of ALPHA, shared by its members.
     """
-    limit = ALPHA / 4
+    families = [*([_two_sided(z) for z in family] for family in (bias, spread, [level])), list(p.values())]
+    limit = ALPHA / len(families)
     biased = [i for i in range(len(names)) if _two_sided(bias[i]) < limit / len(names)]
     odd_width = [i for i in range(len(names)) if _two_sided(spread[i]) < limit / len(names)]
     joint = _two_sided(level) < limit
@@ -206,7 +219,10 @@ def _verdict(
     worst = min(p, key=lambda name: p[name])
     if p[worst] < limit / len(p):
         return ODD, f"{ODD}: the ranks of {worst} are not uniform (p = {p[worst]:.1g}), the shape is wrong", ()
-    return CALIBRATED, CALIBRATED, ()
+    together, lowest = min((len(families) * len(family) * min(family), min(family)) for family in families)
+    if together > NEGLIGIBLE:
+        return CALIBRATED, CALIBRATED, ()
+    return CALIBRATED, f"{CALIBRATED} (lowest p {lowest:.2g}; corrected for all tests {together:.2g})", ()
 
 
 def _two_sided(z: float) -> float:

@@ -43,6 +43,8 @@ def calibrate_product(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
     if round_.loop.settings.temperature:
         return answer, Evidence()
     clock, known = time.perf_counter(), round_.known
+    if known > 1:  # of one trajectory there is no product to judge
+        round_.begin("testing products")
     found = recalibrated(round_, answer.posterior, judge(round_))
     if found is None:
         return answer, Evidence()

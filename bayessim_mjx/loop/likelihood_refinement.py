@@ -47,6 +47,7 @@ def refine_by_replays(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
         warnings.append(f"bayessim.refine: {_without_noise(likelihood.silent, likelihood.physics.mj_model)}")
     if not likelihood.seen.any():
         return answer, Evidence(warnings=warnings)
+    round_.begin("replaying the real motion")
     seed = int(jax.random.randint(branch(loop.key(round_.number, "fit"), 3), (), 0, 2**31 - 1))
     found = refine(answer.posterior, likelihood, seed=seed, components=b.components)
     seconds = {"refine": time.perf_counter() - clock}
@@ -127,7 +128,8 @@ class Refinement:
         if not self.used:
             return f"the network's posterior is kept: {self.refined.reason}"
         text = f"refined by {self.refined.simulations} replays, effective sample size {self.refined.effective:.0f}"
-        return text + (f", {self.widening:.2g} times wider as trajectories disagree" if self.widening > 1 else "")
+        wider = f", {self.widening:.2g} times wider as trajectories disagree" if self.widening > 1 else ""
+        return f"{text}{wider}; it replaces the network's"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""

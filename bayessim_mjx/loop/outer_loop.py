@@ -8,6 +8,7 @@ trajectories so far, multiplied, give the next domain. All of a round runs on th
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -27,8 +28,8 @@ from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import ranges
 from bayessim_mjx.loop.examination import reexamine
 from bayessim_mjx.loop.round_inference import PREDICTIVE_DRAWS, infer, new_network, score
-from bayessim_mjx.loop.sources import Recorded, make_source
-from bayessim_mjx.loop.state import KEPT_ROUNDS, Loop, LoopState, RoundInfo, domain_or_prior
+from bayessim_mjx.loop.sources import Recorded, make_source, with_surrogate
+from bayessim_mjx.loop.state import KEPT_ROUNDS, UNWATCHED, Begin, Loop, LoopState, RoundInfo, domain_or_prior
 from bayessim_mjx.loop.trajectories import no_motion
 from bayessim_mjx.loop.watching import Monitor, Watching
 from bayessim_mjx.parameters.ranged import Ranged
@@ -57,7 +58,7 @@ class Checkpoints(Protocol):
 def make(config: Config, env: Env) -> Loop:
     """Build the loop's static parts; refuses configurations that cannot work."""
     b, units = config.bayessim, config.ppo.memory_size
-    env = remembering(env, units) if units else env
+    env, config = remembering(env, units) if units else env, with_surrogate(config, env)
     if b.modelClass is None:
         # The ablation infers nothing, but is scored on the same surrogate.
         source = make_source(config, env) if len(env.space) else None
@@ -86,13 +87,17 @@ def make(config: Config, env: Env) -> Loop:
     return Loop(env, config, source, len(names), names)
 
 
-def init(loop: Loop, trains: bool = True) -> LoopState:
+def init(loop: Loop, trains: bool = True, progress: bool | None = None) -> LoopState:
     """Make the state before round 0: an untrained policy, the prior as domain, no data.
 
-    trains: whether training comes next, its program then being compiled beside the first reset's.
+    Args:
+        trains: whether training comes next, its program then being compiled beside the first reset's.
+        progress: as `run` takes it.
     """
     fields = blank(loop)
-    policy = _new_policy(loop, 0, fields["domain"], rl.start if trains else rl.init)
+    with shown(progress) as show:
+        show("compiling the training" if trains else "setting up", 0, 1)
+        policy = _new_policy(loop, 0, fields["domain"], rl.start if trains else rl.init)
     return LoopState(round=jnp.int32(0), train=policy, **fields)
 
 
@@ -157,8 +162,9 @@ def train(loop: Loop, state: LoopState, progress: Callable[[dict, TrainState], N
     return dataclasses.replace(state, train=trained)
 
 
-def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
+def step(loop: Loop, state: LoopState, begin: Begin = UNWATCHED) -> tuple[LoopState, RoundInfo]:
     """Do the rest of a round, after training: evaluate, collect, fit, condition on all real trajectories."""
+    begin("evaluating the policy")
     started, seconds = time.perf_counter(), {}
     round_, policy = int(state.round), rl.policy_of(state.train)
     returns, lengths = _evaluate(loop, state, policy)
@@ -180,7 +186,7 @@ def step(loop: Loop, state: LoopState) -> tuple[LoopState, RoundInfo]:
     )
     if loop.settings.modelClass is not None:
         before = state.domain
-        state, found = infer(loop, state, policy)
+        state, found = infer(loop, state, policy, begin)
         info = info.with_(found)
         if state.settled is not None and round_:
             info.settled = loop.settled(before, state.domain)
@@ -246,7 +252,7 @@ def _rounds(
         state = train(loop, state, progress)
         seconds = time.perf_counter() - clock
         policy, number = rl.policy_of(state.train), checkpoint_step(loop, round_, state.train) + 1
-        state, info = step(loop, state)
+        state, info = step(loop, state, functools.partial(monitor.part, round_))
         info.seconds["train"] = seconds
         monitor.round(info, policy)  # first: a round that was not reported is not finished
         if checkpoints is not None:

@@ -27,7 +27,7 @@ from bayessim_mjx.inference.range_ends import Pile
 from bayessim_mjx.keys import branch
 from bayessim_mjx.loop import examination, likelihood_refinement, ranges, set_posterior
 from bayessim_mjx.loop.posterior import condition
-from bayessim_mjx.loop.state import Answer, Evidence, Learnt, Loop, LoopState, Round, space_of
+from bayessim_mjx.loop.state import UNWATCHED, Answer, Begin, Evidence, Learnt, Loop, LoopState, Round, space_of
 from bayessim_mjx.loop.trajectories import Simulations, observe, simulate
 from bayessim_mjx.parameters import ParameterSpace
 from bayessim_mjx.quantities import percent
@@ -54,18 +54,21 @@ CORRECTIONS: tuple[Callable[[Round, Answer], tuple[Answer, Evidence]], ...] = (
 )
 
 
-def infer(loop: Loop, state: LoopState, policy: Policy) -> tuple[LoopState, Evidence]:
+def infer(loop: Loop, state: LoopState, policy: Policy, begin: Begin = UNWATCHED) -> tuple[LoopState, Evidence]:
     """Simulate, learn, condition on all real trajectories and correct; return the next state and the evidence."""
     begun = time.perf_counter()
+    begin("simulating trajectories")
     state, simulations, spent = simulate(loop, state, policy)
     state, real = observe(loop, state, policy)
-    state, learnt, trained = learn(loop, state, simulations)
+    state, learnt, trained = learn(loop, state, simulations, begin)
+    begin("conditioning on real motion")
     state, answer, combined = condition(loop, state)
-    round_, found = Round(loop, state, policy, real, learnt), [spent, trained, combined]
+    round_, found = Round(loop, state, policy, real, learnt, begin), [spent, trained, combined]
     for correct in CORRECTIONS:
         answer, corrected = correct(round_, answer)
         found.append(corrected)
     posterior, moves, moved = ranges.move(loop, state, answer.posterior)
+    begin("predicting the real motion")
     described = describe(round_, answer)
     domain, judged = conclude(round_, answer, posterior, moves)
     proposal = rounds.following(posterior, loop.settings.proposal) if loop.sequential else None
@@ -75,15 +78,20 @@ def infer(loop: Loop, state: LoopState, policy: Policy) -> tuple[LoopState, Evid
     return state, evidence + Evidence(seconds={"condition": rest})
 
 
-def learn(loop: Loop, state: LoopState, simulations: Simulations) -> tuple[LoopState, Learnt, Evidence]:
+def learn(
+    loop: Loop, state: LoopState, simulations: Simulations, begin: Begin = UNWATCHED
+) -> tuple[LoopState, Learnt, Evidence]:
     """Train the network and check it; train a new one where the network of the last round has lost its range."""
     b, known_before = loop.settings, np.asarray(state.fit.identified)
+    begin("fitting the network")
     state, fit, trained = train(loop, state, simulations)
+    begin("testing the network")
     verdict, checked = check(loop, state, simulations)
     found = trained + checked
     goes_on = b.checkTrajs and b.ftune and int(state.round)
     if goes_on and lost(verdict and verdict[0], simulations.held[1]):
         warning = "the network of the last round lost its range under this round's policy: fitted anew"
+        begin("fitting a new network")
         state, fit, trained = train(loop, state, simulations, anew=True)
         verdict, checked = check(loop, state, simulations)
         found += Evidence(warnings=[warning]) + trained + checked

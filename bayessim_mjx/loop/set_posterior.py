@@ -76,6 +76,7 @@ def use_set_network(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
     if answer.source != "product" or b.sets == "product" or round_.known < 2:
         return answer, Evidence()
     clock = time.perf_counter()
+    round_.begin("learning a network of sets")
     try:
         found, posterior = _learnt(round_.loop, round_.state, round_.policy, answer)
     except UserError as error:

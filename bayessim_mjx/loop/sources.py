@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from bayessim_mjx.compat import brief
-from bayessim_mjx.config import Config
+from bayessim_mjx.config import Config, freeze, replace
 from bayessim_mjx.config.settings import number as finite
 from bayessim_mjx.env import Env
 from bayessim_mjx.errors import UserError
@@ -169,6 +169,19 @@ def make_source(config: Config, env: Env) -> Source:
     )
 
 
+def with_surrogate(config: Config, env: Env) -> Config:
+    """Draw hidden parameters by the seed where neither they nor logs are given; effects stay nominal.
+
+    They are of the middle half of each prior: there the posterior shows both of its sides.
+    """
+    if config.env.realParams is not None or config.real.logs or not len(env.space):
+        return config
+    unit = np.random.default_rng(config.seed).uniform(0.25, 0.75, len(env.space)).astype(np.float32)
+    drawn = np.asarray(env.space.from_unit(jnp.asarray(unit)))
+    row = {p.name: float(x) for p, x in zip(env.space.parameters, drawn, strict=True) if p.kind != "effect"}
+    return replace(config, env={"realParams": freeze({"means": [row]})}) if row else config
+
+
 def real_parameters(
     settings: Any, space: ParameterSpace, ends: tuple[np.ndarray, np.ndarray] | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -285,4 +298,5 @@ __all__ = [
     "make_source",
     "policy_function",
     "real_parameters",
+    "with_surrogate",
 ]

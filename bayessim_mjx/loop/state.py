@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, Literal
 
 import flax.struct
@@ -27,6 +28,9 @@ from bayessim_mjx.physics.visuals import collides
 from bayessim_mjx.quantities import percent
 from bayessim_mjx.rl import Policy, TrainState
 from bayessim_mjx.rollout import Trajectory
+
+Begin = Callable[[str], None]  # is called with the name of each part of a round when it begins
+UNWATCHED: Begin = lambda part: None  # noqa: E731
 
 # rounds of simulations kept for the fit where the collection policy does not change; source: memory alone
 KEPT_ROUNDS = 4
@@ -247,6 +251,7 @@ class Round(Situation):
 
     real: Trajectory  # this round's
     learnt: Learnt
+    begin: Begin = UNWATCHED
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from bayessim_mjx.loop.state import Loop, LoopState, RoundInfo
 from bayessim_mjx.progress import Show, Silent
@@ -18,6 +18,13 @@ class Monitor(Protocol):
 
     def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None: ...
     def round(self, info: RoundInfo, policy: Policy) -> None: ...
+
+
+@runtime_checkable
+class PartMonitor(Monitor, Protocol):
+    """A monitor that hears of the parts of a round after training too."""
+
+    def part(self, round_: int, name: str) -> None: ...
 
 
 class Watching:
@@ -45,8 +52,12 @@ class Watching:
         self.show(self._of(round_, "training"), done, n, note)
         if self.monitor is not None:
             self.monitor.training(round_, metrics, state)
-        if done >= n:
-            self.show(self._of(round_, "evaluation, simulation, inference"), 0, 1)
+
+    def part(self, round_: int, name: str) -> None:
+        """Begin a part of the round after training."""
+        self.show(self._of(round_, name), 0, 1)
+        if isinstance(self.monitor, PartMonitor):
+            self.monitor.part(round_, name)
 
     def round(self, info: RoundInfo, policy: Policy) -> None:
         if self.monitor is not None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 COMPILE = "/jax/core/compile/"
 BACKEND = COMPILE + "backend_compile_duration"
 RETRIEVED = "/jax/compilation_cache/cache_retrieval_time_sec"
+REPORTED = 2.0  # seconds of compilation that get a line
 CACHED = 0.5  # of the compiler's time, so that a start counts as one from the cache
 STEPS = 100_000  # timesteps of a reference
 BODY = """
@@ -51,6 +52,10 @@ class Clock:
         return max(self.now() - self.begun - self.excluded, 0.0) / steps * max(self.total - self.done, 0)
 
 
+class _Console(Protocol):
+    def compile(self, message: str, seconds: float, cached: bool = False) -> None: ...
+
+
 class CompileClock:
     """Counts from its construction on; `take` gives what has come since the last call."""
 
@@ -68,8 +73,8 @@ class CompileClock:
             return
         self.backend += duration_secs if event == BACKEND else 0.0
         begun, end = self.now() - duration_secs, self.now()
-        while self.spans and self.spans[-1][0] >= begun:  # what this one contains: a program traced inside another
-            self.spans.pop()
+        while self.spans and self.spans[-1][1] > begun:  # a program traced inside another, or compiled beside it
+            begun = min(begun, self.spans.pop()[0])
         self.spans.append((begun, end))
 
     def take(self) -> tuple[float, bool]:
@@ -78,3 +83,10 @@ class CompileClock:
         cached = self.retrieved > CACHED * self.backend
         self.spans, self.backend, self.retrieved = [], 0.0, 0.0
         return seconds, cached
+
+    def report(self, console: _Console, what: str) -> bool:
+        """Print what was compiled since the last call, if it took long enough; whether it did."""
+        seconds, cached = self.take()
+        if long := seconds > REPORTED:
+            console.compile(what, seconds, cached)
+        return long

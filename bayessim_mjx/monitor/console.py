@@ -7,23 +7,20 @@ searched.
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, TextIO
 
-from bayessim_mjx.config import Config
-from bayessim_mjx.monitor.clock import Clock, reference
+from bayessim_mjx.monitor.clock import Clock
 from bayessim_mjx.monitor.output import Bars, Output
 from bayessim_mjx.monitor.tables import TIE, fit, named, shorten, spoken, without_prefix
+from bayessim_mjx.progress import BEAT, beating
 from bayessim_mjx.quantities import compact, duration, estimate, is_number, spread
 
 WIDTHS = "posterior/prior sd"
-# references (`clock.reference`) that the first start of `main --task Pendulum` spends on tracing and compiling; source:
-# benchmarks/records/clock.json
-COMPILES = 200
-NAMES = {"jax": "MJX's JAX implementation", "warp": "MuJoCo Warp"}
 
 
 class Console:
@@ -47,7 +44,9 @@ class Console:
         self._bars: Bars | None = None
         self._rounds: Clock | None = None
         self._steps: Clock | None = None
-        self._phase = ""
+        self._phase, self._begun, self._most = "", 0.0, ""
+        self._quiet, self._wait, self._written = 0.0, BEAT, 0  # since when nothing was printed, how long that may last
+        self._beating = contextlib.ExitStack()
         self._showwarning = warnings.showwarning
 
     def __enter__(self) -> Console:
@@ -61,10 +60,13 @@ class Console:
                 before(message, category, *where, **more)
 
         warnings.showwarning = show
+        if not self.live:
+            self._beating.enter_context(beating(self._beat))
         return self
 
     def __exit__(self, *_: object) -> None:
         warnings.showwarning = self._showwarning
+        self._beating.close()
         self.close()
 
     @property
@@ -92,20 +94,35 @@ class Console:
             for line in more:
                 self._out.line(line)
 
-    def begin(self, rounds: int, done: int = 0) -> None:
-        """Announce rounds to come, `done` of them finished before (resume)."""
+    def begin(self, rounds: int, done: int = 0, at_most: bool = False) -> None:
+        """Announce rounds to come, `done` of them finished before (resume); `at_most`: they may end sooner."""
+        self._most = "at most " if at_most else ""
         self._rounds = Clock(rounds, done, self._now)
         self._bar("round", f"round {min(done + 1, rounds)}/{rounds}", rounds, done)
 
     def phase(self, name: str, total: int | None = None, done: int = 0) -> None:
         """Begin a part of the round (train, evaluate, simulate, fit ...), with `total` iterations if it has any."""
-        self._phase = name
+        self._phase, self._begun = name, self._now()
         self._steps = Clock(total, done, self._now) if total else None
         self._bar("phase", name, total, done)
         if not self.live:
-            clock = self._rounds
-            where = "" if clock is None else f"round {min(clock.done + 1, clock.total)}/{clock.total}: "
-            self._out.say(f"{where}{name} ..." if not total else f"{where}{name}, {total - done} iterations ...")
+            what = self._where() + name
+            self._out.say(f"{what} ..." if not total else f"{what}, {total - done} iterations ...")
+
+    def _where(self) -> str:
+        """Name the round that runs, where there are rounds."""
+        clock = self._rounds
+        return "" if clock is None else f"round {min(clock.done + 1, clock.total)}/{clock.total}: "
+
+    def _beat(self) -> None:
+        """Print that a part still runs after BEAT s without a line, then after twice as long, and so on."""
+        now = self._now()
+        if self._written != self._out.written:
+            self._quiet, self._wait, self._written = now, BEAT, self._out.written
+        elif self._phase and now - self._quiet >= self._wait:
+            self._wait *= 2
+            self._out.say(f"{self._where()}{self._phase}, {duration(now - self._begun)} so far")
+            self._written = self._out.written
 
     def compile(self, message: str, seconds: float, cached: bool = False) -> None:
         """Keep the time of a compilation out of the ETA. `cached`: the program came from the compilation cache."""
@@ -134,6 +151,8 @@ class Console:
             where += f" {int(at)}"
         if self._bars is not None and "phase" in self._bars:
             self._bars.move("phase", done, fit(numbers, self._bars.note_room(), "  ", count=False), eta)
+            if self._steps is not None and self._steps.done >= self._steps.total:  # the bar goes: its numbers stay
+                self._out.facts([where, *numbers], "")
             return
         ahead = f"  ETA {duration(eta)}" if eta else ""
         self._out.say(f"{where}  " + fit(numbers, self.width - len(where) - len(ahead) - 2, "  ", count=False) + ahead)
@@ -148,6 +167,7 @@ class Console:
         gain: float | None = None,
         widths: Mapping[str, float] | None = None,
         seconds: float | None = None,
+        ends: bool = False,
     ) -> None:
         """One line for a finished round; what is None is left out.
 
@@ -156,6 +176,7 @@ class Console:
             reward: mean (and standard deviation) of the return on the real system, or `where` it was measured.
             gain: log posterior - log prior at the truth [nats].
             widths: {parameter: posterior sd / prior sd}, in the order of interest: as many as fit are shown.
+            ends: whether no further round follows.
         """
         if self._rounds is not None:
             self._rounds.advance(int(round) + 1)
@@ -165,9 +186,9 @@ class Console:
             parts.append(f"{where} return {estimate(*reward) if isinstance(reward, Sequence) else compact(reward)}")
         if gain is not None and is_number(gain):
             parts.append(f"log density at the truth {float(gain):+.2f} nats over the prior")
-        eta = self._rounds.eta() if self._rounds is not None else None
+        eta = self._rounds.eta() if self._rounds is not None and not ends else None
         tail = [] if seconds is None else [duration(float(seconds))]
-        tail += [f"ETA {duration(eta)}"] if eta else []
+        tail += [f"ETA {self._most}{duration(eta)}"] if eta else []
         if widths:
             room = self.width - len(f"    {WIDTHS} ")
             brief = without_prefix(list(widths))
@@ -176,7 +197,7 @@ class Console:
         self._out.facts(parts + tail, "bold")
         if self._rounds is not None and self._bars is not None:
             done, total = self._rounds.done, self._rounds.total
-            self._bars.move("round", done, "", eta, f"round {min(done + 1, total)}/{total}")
+            self._bars.move("round", done, "", eta, f"round {min(done + 1, total)}/{total}", self._most)
 
     def table(self, parameters: Sequence[Mapping[str, Any]], title: str = "parameters", beside: str = "") -> None:
         """Print the closing table, best identified first: {name, unit, low, high, median, q16, q84, sd, width, truth}.
@@ -234,51 +255,3 @@ class Console:
         if self.live:
             self._bars = self._bars or Bars(self._out.rich, self.width)
             self._bars.show(kind, text, total, done)
-
-
-def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[str, Any]:
-    """List {what: value} for `Console.start`; `infers`: the outer loop, else PPO alone."""
-    lines: dict[str, Any] = {"task": f"{config.task}, {'adaptive domain randomisation' if infers else 'PPO alone'}"}
-    if infers or config.randomization.get("randomize"):
-        lines["parameters"] = [_range(p) for p in env.space.parameters] or "none"
-    if config.domain is not None:
-        lines["drawn from"] = config.domain
-    if infers:
-        logs = ", ".join([config.real.logs] if isinstance(config.real.logs, str) else map(str, config.real.logs or ()))
-        lines["real side"] = f"recorded motion in {logs}" if logs else "surrogate: the simulator at hidden parameters"
-    lines["budget"] = _budget(config, infers)
-    if infers and config.bayessim.modelClass is not None:
-        lines["inference"] = _inference(config.bayessim)
-    lines["device"] = str(device)
-    if (chosen := getattr(env, "chosen", None)) is not None:
-        lines["physics"] = f"{NAMES[chosen.impl]}, taken by env.impl=auto: {chosen.why}"
-    seconds = duration(COMPILES * reference(steps=5000)[1])
-    note = f"the first start compiles its programs (the pendulum's: about {seconds} on this machine), "
-    lines |= {"seed": config.seed, "note": f"{note}later starts load them from the cache"}
-    return lines
-
-
-def _range(p: Any) -> str:
-    unit = f" {p.unit}" if p.unit else ""
-    return f"{p.name} {compact(p.low)} to {compact(p.high)}{unit}"
-
-
-def _budget(config: Config, infers: bool) -> str:
-    ppo, b = config.ppo, config.bayessim
-    steps = ppo.max_iterations * ppo.num_steps * ppo.num_envs
-    training = f"{ppo.max_iterations} PPO iterations × {ppo.num_envs} worlds × {ppo.num_steps} steps"
-    if not infers:
-        return f"{training} = {compact(steps)} steps"
-    whole = f"{b.realIters} rounds × ({training}) = {compact(b.realIters * steps)} steps"
-    if b.modelClass is None:
-        return f"{whole}; no inference (bayessim.modelClass=None)"
-    return f"{whole}; {b.trainTrajs} simulated trajectories per round to infer from"
-
-
-def _inference(b: Any) -> str:
-    """Network, summary and, where they are not the plain ones, coordinates, proposal and temperature."""
-    parts = [b.modelClass if b.ensemble == 1 else f"{b.ensemble} × {b.modelClass}", b.summarizerFxn]
-    parts += [f"{b.coordinates} coordinates"] if b.coordinates != "plain" else []
-    parts += [f"later rounds simulated from the posterior ({b.proposal})"] if b.proposal != "prior" else []
-    parts += [f"standard deviations times {b.temperature:g}"] if b.temperature not in (None, 1.0) else []
-    return ", ".join(parts)

@@ -1,6 +1,7 @@
 """Lines, tables and frames on a terminal, or in a file that is to be searched; progress bars on a terminal."""
 
 import os
+import time
 from collections.abc import Collection, Sequence
 from typing import Any, TextIO
 
@@ -9,7 +10,8 @@ from bayessim_mjx.quantities import ascii_of, duration
 
 FILE_WIDTH = 140  # columns that tables and lists may take where there is no terminal
 LEAST_WIDTH = 40  # narrower terminals break words
-LONGEST = "ETA 59 min 59 s"  # room that the time to go may take
+LONGEST = "ETA 59 min 59 s"  # room that the time to go may take beside numbers
+HIDDEN = 2.0  # s of a step without a known end before the bar shows how long it has run
 
 
 class Output:
@@ -25,7 +27,7 @@ class Output:
             options |= dict(force_terminal=False, no_color=True, width=self._columns or FILE_WIDTH)
         self.rich = RichConsole(**options)
         self._unicode = "utf" in (getattr(file, "encoding", None) or "utf-8").lower()
-        self._blank = False
+        self._blank, self.written = False, 0
 
     @property
     def width(self) -> int:
@@ -105,6 +107,7 @@ class Output:
         from rich.text import Text
 
         line, self._blank = Text(self.plain(text)), not text
+        self.written += 1
         if self.live and style:
             line.stylize(style, 0, styled)
         self.rich.print(line)
@@ -122,7 +125,7 @@ class Bars:
             TextColumn("{task.description:<14}"),
             BarColumn(self.bar),
             TextColumn("{task.fields[count]}"),
-            TextColumn("{task.fields[eta]}"),
+            _time_column(),
             TextColumn("{task.fields[note]}"),
         )
         self._progress = Progress(*columns, console=console, transient=True)
@@ -137,10 +140,13 @@ class Bars:
         if kind in self._tasks:
             self._progress.remove_task(self._tasks[kind])
         self._tasks[kind] = self._progress.add_task(
-            text, total=total, completed=done, eta="", note="", count=_count(done, total)
+            text, total=total, completed=done, end=None, most="", note="", count=_count(done, total)
         )
 
-    def move(self, kind: str, done: int | None, note: str, eta: float | None, text: str | None = None) -> None:
+    def move(
+        self, kind: str, done: int | None, note: str, eta: float | None, text: str | None = None, most: str = ""
+    ) -> None:
+        """Move a bar to `done`; `most` stands before the time to go."""
         if kind not in self._tasks:
             return
         more: dict[str, Any] = {} if text is None else {"description": text}
@@ -149,8 +155,8 @@ class Bars:
             more["count"] = _count(done, total)
         from rich.markup import escape
 
-        said = f"ETA {duration(eta)}" if eta else ""
-        self._progress.update(self._tasks[kind], completed=done, note=escape(note), eta=said, **more)
+        end = time.monotonic() + eta if eta else None
+        self._progress.update(self._tasks[kind], completed=done, note=escape(note), end=end, most=most, **more)
 
     def note_room(self) -> int:
         """Columns beside spinner, description, bar, count and time to go, each as wide as its widest."""
@@ -161,6 +167,22 @@ class Bars:
 
     def close(self) -> None:
         self._progress.stop()
+
+
+def _time_column() -> Any:
+    """Make the column of a bar that counts the time to go down; without an end it shows the time since the start."""
+    from rich.progress import ProgressColumn
+    from rich.text import Text
+
+    class Times(ProgressColumn):
+        def render(self, task: Any) -> Text:
+            left = -1.0 if task.fields["end"] is None else task.fields["end"] - time.monotonic()
+            if left > 0:
+                return Text(f"ETA {task.fields['most']}{duration(left)}")
+            passed = task.elapsed or 0.0
+            return Text(f"{duration(passed)} so far" if passed > HIDDEN else "")
+
+    return Times()
 
 
 def _count(done: float | None, total: float | None) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from bayessim_mjx.monitor.draws import Draws, density, density2, levels
 from bayessim_mjx.monitor.style import BLUE, DASHED, GREEN, GREY, NAVY, RED, YELLOW, blues, size_of
 from bayessim_mjx.monitor.tables import shorten
-from bayessim_mjx.quantities import compact, spread
+from bayessim_mjx.quantities import compact, fixed, spread
 
 Limits = tuple[float, float]
 NARROWEST = 1e-4  # of the prior range: no axis is narrower, as its ticks would have too many digits
@@ -28,7 +28,10 @@ def triangle(figure: Any, draws: Draws, true: np.ndarray | None, top: float = 0.
         for column in range(d):
             axes = grid[row, column]
             if column > row:
+                corner = axes.get_position()
                 axes.remove()
+                if d == 2:
+                    facts(figure, (corner.x0 + 0.02, corner.y1 - 0.02), draws, true)
                 continue
             if column == row:
                 marginal(axes, draws, row, true, limits[row])
@@ -57,6 +60,16 @@ def _name_edges(grid: Any, draws: Draws, cell: tuple[float, float], size: float,
         if k > 0:
             grid[k, 0].set_ylabel(label(draws, k, room[1], 3), fontsize=size)
             grid[k, 0].yaxis.set_label_coords(-0.48 / cell[0], 0.5)
+
+
+def facts(figure: Any, corner: tuple[float, float], draws: Draws, true: np.ndarray | None) -> None:
+    """Write numbers that no title has into the empty cell of two parameters, from its upper left corner on."""
+    lines = [f"correlation   {fixed(draws.numbers.correlation[0, 1], 2)}", "", "posterior/prior sd"]
+    lines += [f"    {n}   {w:.2g}" for n, w in zip(shorten(draws.names, 24), draws.numbers.width, strict=True)]
+    if true is not None:
+        values = [compact(natural(draws, k, true[k])) for k in range(draws.d)]
+        lines += ["", "truth", *(f"    {n}   {v}" for n, v in zip(shorten(draws.names, 24), values, strict=True))]
+    figure.text(*corner, "\n".join(lines), va="top", fontsize=7.5, linespacing=1.5)
 
 
 def marginal(axes: Any, draws: Draws, k: int, true: np.ndarray | None, limits: Limits) -> None:

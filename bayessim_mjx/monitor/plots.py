@@ -168,13 +168,14 @@ def _truth(truth: Any, names: Sequence[str]) -> np.ndarray | None:
     return vector
 
 
-def calibration(report: Any, *, round: int | None = None, sets: Any = None) -> Any:
+def calibration(report: Any, *, round: int | None = None, sets: Any = None, replaced: bool = False) -> Any:
     """Left: share of truths inside the posterior's regions against their nominal mass. Right: ranks of each parameter.
 
     Args:
         report: inference.calibration.Report.
         round: for the heading.
         sets: inference.product_calibration.Sets, for a third picture: products as they are used.
+        replaced: whether the posterior in use is another one, that of replays.
     """
     figure = new_figure(11.0 if sets is None else 16.0, 5.2, layout="constrained")
     axes = figure.subplots(1, 2 if sets is None else 3)
@@ -182,7 +183,8 @@ def calibration(report: Any, *, round: int | None = None, sets: Any = None) -> A
     _ranks(axes[1], report)
     if sets is not None:
         _sets(axes[2], sets)
-    figure.suptitle(textwrap.fill(heading(f"posterior {report.words}", round), 120), fontsize=11)
+    title = textwrap.fill(heading(f"network's posterior {report.words}", round), 120)
+    figure.suptitle(title + "\nThe posterior in use is that of the replays." * replaced, fontsize=11)
     return figure
 
 
@@ -197,15 +199,18 @@ def _coverage(axes: Any, report: Any) -> None:
     axes.fill_between(at, low, high, color=GREY, alpha=0.2, lw=0, label=STAYS)
     axes.plot(at, _ecdf(report.ranks.level, at), color=BLUE, lw=2, label="densest regions (HPD)")
     axes.plot(at, _ecdf(report.ranks.tarp, at), color=GREEN, lw=1.5, ls="--", label="regions around a point (TARP)")
+    for name, masses in report.intervals().items():  # the verdict rests on these
+        axes.plot(at, _ecdf(masses, at), color=RED, lw=1.5, label=f"intervals of {shorten([name], 30)[0]}")
     for level, (share, error) in report.coverage.items():
         reach = [[min(2 * error, share)], [min(2 * error, 1 - share)]]
         bar = axes.errorbar([level], [share], yerr=reach, color="black", marker="o", ms=4, capsize=3, clip_on=False)
-    bar.set_label("observed coverage, ± 2 standard errors")
+    bar.set_label("HPD coverage, ± 2 standard errors")
     axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="probability of the region", ylabel="share of true parameters inside")
     axes.set_title("coverage: below the band the posterior is too narrow, above too wide", fontsize=9, loc="left")
     axes.legend(loc="upper left", frameon=False, fontsize=8)
-    rows = [f"{percent(a)}:  {percent_estimate(c, e, 1)}" for a, (c, e) in report.coverage.items()]
-    text = "\n".join(["observed coverage", *rows])
+    what, shares = next(iter(report.interval_coverage().items()), ("HPD coverage", report.coverage))
+    rows = [f"{percent(level)}:  {percent_estimate(share, error, 1)}" for level, (share, error) in shares.items()]
+    text = "\n".join([shorten([what], 36)[0], *rows])
     axes.text(0.97, 0.03, text, ha="right", va="bottom", fontsize=8, linespacing=1.4, transform=axes.transAxes)
 
 
@@ -248,7 +253,7 @@ def _ranks(axes: Any, report: Any) -> None:
     shapes = (
         "ranks: a hump is a posterior too high, a dip one too low;\nup then down is too narrow, down then up too wide"
     )
-    axes.set_title(shapes, fontsize=9, loc="left")
+    axes.set_title(f"{shapes}\na fault: p below {report.limit:.1g}", fontsize=9, loc="left")
     low, high = axes.get_ylim()
     wide = max(-low, high, 2 * half)
     lines = min(len(worst), MOST) + 1

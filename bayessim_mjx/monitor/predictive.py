@@ -132,8 +132,9 @@ def quantity(channel: str, unit: str) -> tuple[str, str]:
 def _axis(channel: str, unit: str, thin: bool) -> str:
     what, joint = quantity(channel, unit)
     short = shorten([joint], 22)[0]
-    from_median = ("\n" * bool(what) + "minus median") * thin
-    return f"{what} of\n{short}" * bool(what) + from_median + f" [{unit}]" * bool(unit)
+    if thin:  # the panel's title names quantity and joint
+        return "minus median" + f" [{unit}]" * bool(unit)
+    return f"{what} of\n{short}" * bool(what) + f" [{unit}]" * bool(unit)
 
 
 def _title(channel: str, unit: str, real: np.ndarray, simulated: np.ndarray, thin: bool) -> str:

@@ -23,8 +23,6 @@ from bayessim_mjx.rl import Policy, policy_of
 
 MOST_PAIRS = 10  # BayesSimIG draws one figure per pair; beyond this the corner plot shows them all
 ROUNDS = "rounds.jsonl"
-WORTH_SAYING = 0.5  # seconds of compilation
-REST = "evaluation, simulation, inference"  # of a round, after training
 SPEED = "Perf/total_fps"
 SHOWN = (
     "Train/mean_reward", "Train/mean_episode_length", SPEED, "Loss/kl", "Loss/learning_rate", "Loss/value",
@@ -72,7 +70,7 @@ class Session:
         if truth is None and start is not None and first_round:
             self._show_posterior(start.domain)
         self._drop_rounds(first_round)
-        console.begin(config.bayessim.realIters, first_round)
+        console.begin(config.bayessim.realIters, first_round, at_most=config.bayessim.untilSettled)
         self._phase(first_round, done)
 
     def _phase(self, round_: int, done: int = 0) -> None:
@@ -98,34 +96,29 @@ class Session:
         """Write the resolved settings as text, once."""
         self.inference.text(SETTINGS, text, code=True)
 
-    def _compiled(self, what: str) -> bool:
-        """Whether there was compiling long enough for a line; prints it."""
-        seconds, cached = self.compiling.take()
-        if seconds > WORTH_SAYING:
-            self.console.compile(what, seconds, cached)
-        return seconds > WORTH_SAYING
-
     def training(self, round_: int, metrics: dict[str, float], state: LoopState) -> None:
-        slowed = self._compiled("training")
+        slowed = self.compiling.report(self.console, "the training")
         iteration = self._overall(round_, int(state.train.iteration))
         self.learning.scalars(iteration, {tag if "/" in tag else f"Perf/{tag}": v for tag, v in metrics.items()})
         self.wall.scalars(metrics)
         shown = {tag: metrics[tag] for tag in SHOWN if tag in metrics and not (slowed and tag == SPEED)}
-        done, n = iteration - round_ * self.config.ppo.max_iterations, self.config.ppo.max_iterations
-        self.console.iteration(shown, done)
+        self.console.iteration(shown, iteration - round_ * self.config.ppo.max_iterations)
         if self.film is not None and iteration // self._film_every() > self.filmed:
             self.filmed = iteration // self._film_every()
             title = f"{self.config.task}, training iteration {iteration}"
             self._video(self.learning, "Train/video", policy_of(state.train), iteration, title, half=True)
-        if done >= n:
-            self.console.phase(REST)
+
+    def part(self, round_: int, name: str) -> None:
+        """Begin a part of the round after training."""
+        self.console.phase(name)
 
     def _overall(self, round_: int, iteration: int) -> int:
         """One axis over all rounds, also where every round trains a new policy."""
         return iteration if self.config.bayessim.ftuneRL else round_ * self.config.ppo.max_iterations + iteration
 
     def round(self, info: RoundInfo, policy: Policy) -> None:
-        self._compiled("evaluation, simulation and inference")
+        self.compiling.report(self.console, "evaluation, simulation and inference")
+        self.console.phase("drawing the pictures")
         step = info.round + 1
         side = "Domain/rewards" if info.truth is None else "SurrogateReal/real_rewards"
         scalars = {f"{side}_{name}": getattr(np, name)(info.returns) for name in ("mean", "min", "max", "std")}
@@ -147,8 +140,8 @@ class Session:
         if info.checks is not None:
             self.console.say(info.checks.sentence())
         if info.sets is not None:
-            begins = ", where the replays begin" if info.refinement is not None and info.refinement.used else ""
-            self.console.say(f"product of posteriors{begins}: {info.sets.sentence()}")
+            start = ", a start for the replays" if info.refinement is not None and info.refinement.used else ""
+            self.console.say(f"product of the network's posteriors{start}: {info.sets.sentence()}")
         if info.refinement is not None:
             self.console.say(f"posterior: {info.refinement.sentence()}")
             self.inference.text("BayesSim/refinement", info.refinement.sentence(), step)
@@ -172,11 +165,12 @@ class Session:
             return
         step, names = info.round + 1, posterior.space.names
         if info.checks is not None:
-            picture = plots.calibration(info.checks.calibration, round=step, sets=info.sets)
+            replaced = info.refinement is not None and info.refinement.used
+            picture = plots.calibration(info.checks.calibration, round=step, sets=info.sets, replaced=replaced)
             self.inference.figure("BayesSim/calibration", picture, step)
         self.inference.figure("BayesSim/posterior", plots.corner(posterior, truth=info.truth, round=step), step)
         pairs = list(itertools.combinations(range(len(names)), 2))
-        for i, j in pairs if len(pairs) <= MOST_PAIRS else []:
+        for i, j in pairs if 1 < len(pairs) <= MOST_PAIRS else []:  # of two parameters the corner shows all
             figure = plots.pair(
                 posterior, i, j, truth=info.truth, log_gain=info.scores.get("gain_over_prior"), round=step
             )
@@ -294,4 +288,5 @@ def round_line(info: RoundInfo) -> dict[str, Any]:
         "gain": info.scores.get("gain_over_prior"),
         "widths": widths,
         "seconds": sum(info.seconds.values()),
+        "ends": bool(info.settled),
     }

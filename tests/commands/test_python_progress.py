@@ -38,7 +38,7 @@ def test_the_loop_shows_the_parts_of_a_round_and_its_result(capsys: Any, monkeyp
     monkeypatch.setattr(progress, "watched", lambda: True)
     _, [info] = loop.run(parts, loop.init(parts))
     err = capsys.readouterr().err
-    assert "round 1/1: training: 0 of 4" in err and "round 1/1: evaluation, simulation, inference" in err
+    assert "round 1/1: training: 0 of 4" in err and "round 1/1: evaluating the policy" in err
     assert err.splitlines()[-1].startswith("round 1/1: return ") and info.posterior is None
     monkeypatch.setattr(progress, "watched", lambda: False)
     loop.run(parts, loop.init(parts))
@@ -68,7 +68,15 @@ def test_a_monitor_takes_the_place_of_progress(capsys: Any, monkeypatch: pytest.
         def round(self, info: Any, policy: Any) -> None:
             self.rounds += 1
 
+    class Listener(Monitor):
+        parts = ()
+
+        def part(self, round_: int, name: str) -> None:
+            self.parts += ((round_, name),)
+
     monkeypatch.setattr(progress, "watched", lambda: True)
     monitor, parts = Monitor(), loop.make(settings(), TOY)
-    loop.run(parts, loop.init(parts), monitor=monitor)
+    loop.run(parts, loop.init(parts, progress=False), monitor=monitor)
     assert monitor.rounds == 1 and capsys.readouterr() == ("", "")
+    loop.run(parts, loop.init(parts, progress=False), monitor=(listener := Listener()))
+    assert listener.parts == ((0, "evaluating the policy"),)

@@ -285,3 +285,10 @@ def test_refusals_name_the_parameter():
         Uniform(space).product(Uniform(ParameterSpace([MASS])))
     with pytest.raises(ValueError, match="mas"):
         Uniform(space).marginal(["mas"])
+
+
+def test_a_summary_has_a_line_for_each_parameter_in_its_unit():
+    space = ParameterSpace([Parameter("mass", 1.0, 0.5, 2.0, unit="kg"), Parameter("length_mult", 1.0, 0.5, 2.0)])
+    first, second = Distribution.gaussian(space, [1.0, 1.25], 0.1, 3).summary().splitlines()
+    assert first == "mass         1.00 ± 0.10 kg  posterior/prior sd 0.23"
+    assert second == "length_mult  1.25 ± 0.10     posterior/prior sd 0.23"

@@ -194,3 +194,13 @@ def test_the_parameter_named_beside_the_regions_errs_as_they_do():
     p = dict.fromkeys(("a", "b", "HPD level", "TARP"), 0.5)
     _, words, alone = calibration._verdict(("a", "b"), np.zeros(2), np.array([4.0, -9.0]), 5.0, p)
     assert words == "over-confident: too narrow, most in a" and alone == ()
+
+
+def test_calibrated_states_a_low_p_and_what_all_tests_make_of_it():
+    """Corrected for all tests it lies between 1 and 5 %: the word alone would hide that."""
+    p = dict.fromkeys(("a", "b", "HPD level", "TARP"), 0.5)
+    none = np.zeros(2)
+    assert calibration._verdict(("a", "b"), none, none, 0.0, p)[1] == "calibrated"
+    assert calibration._verdict(("a", "b"), none, none, 0.0, p | {"a": 0.01})[1] == "calibrated"
+    found = calibration._verdict(("a", "b"), none, none, 0.0, p | {"a": 0.0012})
+    assert found[:2] == ("calibrated", "calibrated (lowest p 0.0012; corrected for all tests 0.019)")

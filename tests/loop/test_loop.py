@@ -183,7 +183,7 @@ def test_under_logs_only_the_newest_evaluation_counts(monkeypatch, truth):
     monkeypatch.setattr(loop.outer_loop, "train", lambda parts, state, progress: state)
     info = types.SimpleNamespace(truth=truth, returns=returns, seconds={})
     monkeypatch.setattr(
-        loop.outer_loop, "step", lambda parts, state: (dataclasses.replace(state, round=state.round + 1), info)
+        loop.outer_loop, "step", lambda parts, state, begin: (dataclasses.replace(state, round=state.round + 1), info)
     )
     monkeypatch.setattr(rl, "policy_of", lambda state: None)
     blank = dict.fromkeys((f.name for f in dataclasses.fields(loop.LoopState)), jnp.zeros(0))
@@ -301,7 +301,7 @@ def test_summaries_that_do_not_fit_are_refused(env, monkeypatch):
 def test_a_run_ends_after_a_round_that_leaves_the_posterior_as_it_was(env, monkeypatch, means, done):
     parts, given = loop.make(settings("bayessim.realIters=4", "bayessim.untilSettled=True"), env), iter(means)
 
-    def infer(of, state, policy):
+    def infer(of, state, policy, begin):
         posterior = Distribution.gaussian(env.space, [next(given), 1.0], 0.1, 3)
         return dataclasses.replace(state, domain=posterior), Evidence()
 

@@ -141,3 +141,19 @@ def test_a_trajectory_measured_again_has_other_noise_and_nothing_else():
     assert (
         np.abs(np.corrcoef((often[:, 1] - often[:, 0]).ravel(), (often[:, 2] - often[:, 0]).ravel())[0, 1] - 0.5) < 0.1
     )
+
+
+def test_a_task_without_hidden_parameters_gets_them_from_the_seed():
+    """In the middle half of the ranges; given ones stay, and so does a run on logs."""
+    settings = config.replace(config.load("Pendulum"), env={"realParams": None})
+    env = make("Pendulum")
+    found = sources.with_surrogate(settings, env)
+    assert config.from_dict(found.to_dict()) == found == sources.with_surrogate(settings, env)
+    truth = loop.make(settings, env).source.truth
+    low, high = np.asarray(env.space.low), np.asarray(env.space.high)
+    assert (truth > low + 0.25 * (high - low)).all() and (truth < high - 0.25 * (high - low)).all()
+    other = sources.with_surrogate(config.replace(settings, seed=1), env)
+    assert other.env.realParams != found.env.realParams
+    assert sources.with_surrogate(found, env) is found
+    on_logs = config.replace(settings, real={"logs": "somewhere"})
+    assert sources.with_surrogate(on_logs, env) is on_logs

@@ -2,6 +2,7 @@
 
 import io
 import re
+import types
 import warnings
 
 import pytest
@@ -184,3 +185,40 @@ def test_compile_time_of_a_program_inside_another_counts_once():
     clock._duration(RETRIEVED, 0.2)
     clock._duration(BACKEND, 0.3)
     assert clock.take()[1] and clock.take() == (0, False)
+
+
+def test_a_part_without_lines_says_that_it_still_runs():
+    """After 30 s, and then ever more seldom; any other line begins the wait anew."""
+    now, file = [0.0], io.StringIO()
+    console = Console(file=file, now=lambda: now[0])
+    console.begin(5, at_most=True)
+    console.phase("fitting the network")
+    for _ in range(100):
+        now[0] += 1.0
+        console._beat()
+    where = "round 1/5: fitting the network"
+    assert file.getvalue().splitlines() == [f"{where} ...", f"{where}, 31 s so far", f"{where}, 1 min 01 s so far"]
+    console.say("a line")
+    for _ in range(30):
+        now[0] += 1.0
+        console._beat()
+    assert file.getvalue().splitlines()[3:] == ["a line"]
+    console.round_line(round=0)
+    assert "ETA at most 8 min 40 s" in file.getvalue()
+    console.round_line(round=1, ends=True)
+    assert file.getvalue().splitlines()[-1] == "round 2/5"
+
+
+def test_a_bar_counts_the_time_to_go_down_and_shows_the_time_so_far_without_one(monkeypatch):
+    from bayessim_mjx.monitor import output
+
+    now, task = [100.0], types.SimpleNamespace(elapsed=1.0, fields={"end": None, "most": "at most "})
+    monkeypatch.setattr(output.time, "monotonic", lambda: now[0])
+    column = output._time_column()
+    assert column.render(task).plain == ""
+    task.elapsed = 65.0
+    assert column.render(task).plain == "1 min 05 s so far"
+    task.fields["end"] = 190.0
+    assert column.render(task).plain == "ETA at most 1 min 30 s"
+    now[0] = 191.0
+    assert column.render(task).plain == "1 min 05 s so far"

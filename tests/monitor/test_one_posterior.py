@@ -67,7 +67,7 @@ def test_every_view_has_the_posteriors_width_not_that_of_the_prior_it_keeps(tmp_
         assert 1 - row["contraction"] == pytest.approx((sd / PRIOR_SD) ** 2, rel=0.08)
     table = closing_table(q)
     assert "1.0030 ± 0.0022" in table and "0.50000 ± 0.00020" in table and "0.00035" in table
-    assert "0.010 % of the prior is kept beside" in table
+    assert "also draws 0.010 % of its physics from the prior" in table
     assert table.index("length") < table.index("mass")  # 11 times the better known
     figure = plots.corner(q)
     titles = {axes.get_title() for axes in figure.axes}

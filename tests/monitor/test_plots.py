@@ -66,6 +66,13 @@ def outside(figure):
     ]
 
 
+def test_the_empty_cell_of_two_parameters_has_numbers():
+    figure = plots.corner(**case(2))
+    words = " ".join(text for text, _ in texts(figure))
+    assert "correlation" in words and "posterior/prior sd" in words
+    assert overlaps(figure) == [] and outside(figure) == []
+
+
 @pytest.mark.parametrize("d", [1, 2, 5])
 def test_full_corner_has_one_panel_per_pair(d):
     figure = plots.corner(**case(d), round=3)
@@ -213,10 +220,8 @@ def test_a_band_that_would_hide_under_the_line_is_drawn_about_the_median():
     simulated = {"qpos:hinge": real["qpos:hinge"] + 0.01 * rng.normal(size=(200, 30))}
     simulated["qvel:hinge"] = real["qvel:hinge"] + 3 * rng.normal(size=(200, 30))
     figure = plots.predictive(time, real, simulated, units={"qpos:hinge": "rad", "qvel:hinge": "rad/s"})
-    wide, thin = sorted(figure.axes, key=lambda axes: axes.get_ylabel(), reverse=True)
-    assert thin.get_ylabel() == "angle of\nhinge\nminus median [rad]" and "moves by 4 rad)" in thin.get_title(
-        loc="left"
-    )
+    thin, wide = sorted(figure.axes, key=lambda axes: axes.get_ylabel(), reverse=True)
+    assert thin.get_ylabel() == "minus median [rad]" and "moves by 4 rad)" in thin.get_title(loc="left")
     assert max(map(abs, thin.get_ylim())) < 0.05 and max(map(abs, wide.get_ylim())) > 12
     assert overlaps(figure) == [] and outside(figure) == []
 
@@ -270,8 +275,9 @@ def report_of(d, pairs=300):
     ranks = SimpleNamespace(level=rng.random(pairs), tarp=rng.random(pairs), parameters=rng.random((pairs, d)))
     coverage = {0.5: (0.55, 0.029), 0.8: (0.81, 0.023), 0.95: (0.93, 0.013)}
     return SimpleNamespace(
-        pairs=pairs, names=names, words="calibrated", p=dict.fromkeys(names, 0.5), coverage=coverage, ranks=ranks
-    )
+        pairs=pairs, names=names, words="calibrated", p=dict.fromkeys(names, 0.5), coverage=coverage, ranks=ranks,
+        intervals=dict, interval_coverage=dict, limit=0.001,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("d", [2, 13])
@@ -284,6 +290,22 @@ def test_all_that_a_calibration_picture_says_is_inside_of_it(d):
     axes = figure.axes[0].get_window_extent()
     assert axes.x0 < table.x0 and table.x1 < axes.x1 and axes.y0 < table.y0 and table.y1 < axes.y1
     assert sum("(p = " in text for text, _ in words) == min(d, 8)
+
+
+def test_a_calibration_picture_shows_the_intervals_that_its_title_rests_on():
+    """The regions of all parameters hold enough, the intervals of one do not: both are drawn, and the latter named."""
+    from bayessim_mjx.inference import calibration
+    from bayessim_mjx.parameters import Parameter, ParameterSpace
+
+    rng, n = np.random.default_rng(0), 3000
+    pit = np.stack([0.5 + np.clip((rng.random(n) - 0.5) / 0.8, -0.5, 0.5), rng.random(n)], axis=1)
+    even, space = rng.random(n), ParameterSpace([Parameter(name, 1.0, 0.5, 2.0) for name in ("mass", "length")])
+    report = calibration.judge(calibration.Ranks(pit, even, rng.random(n), even, np.ones((n, 2))), space)
+    figure = plots.calibration(report, round=1, replaced=True)
+    words = [text for text, _ in texts(figure)]
+    assert "intervals of mass" in words and any("in use is that of the replays" in text for text in words)
+    assert any("intervals of mass\n50 %:  40" in text for text in words)
+    assert overlaps(figure) == [] and outside(figure) == []
 
 
 def test_a_calibration_picture_shows_posteriors_of_several_trajectories():

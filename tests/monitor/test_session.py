@@ -76,7 +76,7 @@ def test_a_round_says_what_simulated_sets_asked_of_the_product(tmp_path, filmed)
     s.round(said, None)
     s.close()
     text = " ".join(shown.getvalue().split())
-    assert "product of posteriors: with 2 trajectories standard deviations are widened 1.40 times" in text
+    assert "product of the network's posteriors: with 2 trajectories standard deviations are widened 1.40 times" in text
     assert "only 1 of 2 trajectories sharpen the posterior" in text
 
 
@@ -89,7 +89,9 @@ def test_a_round_says_which_posterior_is_in_use(tmp_path, filmed, used):
     said.refinement = types.SimpleNamespace(used=used, sentence=lambda: "as it is", to_dict=dict)
     s.round(said, None)
     s.close()
-    assert ("product of posteriors, where the replays begin: " in " ".join(shown.getvalue().split())) == used
+    assert (
+        "product of the network's posteriors, a start for the replays: " in " ".join(shown.getvalue().split())
+    ) == used
 
 
 def test_videos_under_logs_show_the_newest_posterior(tmp_path, filmed):

@@ -8,7 +8,7 @@ import pytest
 from bayessim_mjx import config, registry
 from bayessim_mjx.effects import make
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.monitor.console import opening
+from bayessim_mjx.monitor.opening import opening
 from bayessim_mjx.physics import implementation, measured
 from bayessim_mjx.physics.implementation import choose, steps
 from bayessim_mjx.versions import of

@@ -11,7 +11,7 @@ import pytest
 from bayessim_mjx import cli, main, registry, runs, trust
 from bayessim_mjx.config import load
 from bayessim_mjx.errors import UserError
-from bayessim_mjx.monitor.console import opening
+from bayessim_mjx.monitor.opening import opening
 
 SLIDER = '''
 import jax.numpy as jnp
