@@ -1,7 +1,5 @@
 """Distributions checked against grids, scipy and closed forms."""
 
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -160,9 +158,6 @@ def test_the_prior_contracts_nothing_and_a_spike_everything():
         0.05, rel=0.02
     )
     assert table["friction"]["sd"] == pytest.approx(0.01, rel=0.05)  # first order in the log
-    lines = str(table).splitlines()
-    assert lines[0].startswith("mass      1.2") and " ± 0.05" in lines[0] and lines[1].startswith("friction  0.2")
-    assert json.loads(json.dumps(table)) == table  # numbers as they are
 
 
 def test_credible_level_of_a_gaussian():

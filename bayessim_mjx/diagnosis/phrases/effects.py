@@ -94,7 +94,8 @@ def spanned(mean: float, low: float, high: float, unit: str) -> str:
 def quantity(name: str, value: Estimate) -> tuple[str, str]:
     """Return a parameter's name and value; reciprocals turned over (`inverse_limit` 0.5 1/(N m) -> limit 2 N m)."""
     if name in RECIPROCALS and finite(value.mean) and value.mean > 0:
-        mean, sd, bound = value.mean, value.sd, value.bound
+        mean, bound = value.mean, value.bound
+        sd: float | None = value.sd
         if finite(sd) and mean < CLEAR * sd:  # may be 0, and its reciprocal infinite
             mean, sd, bound = mean + CLEAR * sd, None, "at most"
         sd = sd / mean**2 if finite(sd) else sd  # d(1/x) = dx / x^2
