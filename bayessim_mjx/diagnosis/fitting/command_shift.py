@@ -1,9 +1,8 @@
-"""Do commands act when the log says? The time by which they act later or earlier, beside all that forces can explain.
+"""Do commands act before their rows? No drive does, so a lead is a fault of the log; a delay is for effects to explain.
 
 Windows are simulated at shifted commands, and linearised in the shift, the known parameters, the actuators' gains, kp
 and kv of servos, and forces of each joint (constant, with position, with speed, with its direction). What remains for
-the shift is its own: friction or a wrong damping do not become one. No drive acts before its command, so a lead is a
-fault of the log.
+the shift is its own: friction or a wrong damping do not become one.
 """
 
 from __future__ import annotations
@@ -51,21 +50,21 @@ class Shift:
 
     @property
     def certain(self) -> bool:
-        """Whether it explains more than all else that is missing does, in all conditions alike."""
-        return self._shows(abs(self.late), self.error + self.apart)
+        """Whether there is a lead that explains more than all else that is missing does, in all conditions alike."""
+        return self._leads(self.error + self.apart)
 
     @property
     def likely(self) -> bool:
         """Whether there is a lead that explains as much, but by conditions' own shifts beside something else."""
-        return self._shows(-self.late, self.error) and not self.certain
+        return self._leads(self.error) and not self.certain
 
-    def _shows(self, size: float, error: float) -> bool:
-        return size > max(SURE * error, LEAST * self.step) and self.explains > 1 - self.explains
+    def _leads(self, error: float) -> bool:
+        return -self.late > max(SURE * error, LEAST * self.step) and self.explains > 1 - self.explains
 
     @property
     def lead(self) -> float:
         """s by which commands are moved: what is certainly a fault of the log; 0 or less."""
-        return min(self.late, 0.0) if self.certain else 0.0
+        return self.late if self.certain else 0.0
 
     def notes(self, period: float) -> list[str]:
         """Return the note for the user; period: s between rows of the log."""
@@ -79,10 +78,6 @@ class Shift:
     def sentence(self, period: float) -> str:
         """Return the finding; period: s between rows of the log."""
         text = f"commands seem shifted by {1e3 * self.late:+.2g} ms (+- {1e3 * self.error:.1g} ms)"
-        if self.late > 0:
-            why = "they act later than the log says. Drives and sensors need such a time, or the time stamps are late"
-            mend = f"`commands_late: {self.late:.4g}` beside the logs takes late time stamps out"
-            return f"{text}: {why}. A delay or lag among the named effects is this shift. {mend}"
         text += ": they act before their rows, which no drive does; they were moved by as much"
         between = abs(self.late / period + 0.5) < 0.15
         smooth = ", as those of samples of a smooth signal do (`hold: linear`)" if between else ""
@@ -90,7 +85,7 @@ class Shift:
 
 
 def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -> Shift | None:
-    """Return the shift of all commands together; None: there are none, or the fit finds no end.
+    """Return the shift of all commands together, roughly where it is no lead; None: no commands, or the fit has no end.
 
     Args:
         step: its errors with their start states fitted; its noise is infinite where nothing was measured.
@@ -123,8 +118,8 @@ def estimate(step: Discretisation, cuts: Callable[..., Windows], force: Array) -
             ratio = gained / max(cost - float(np.sum(predicted**2)), gained)
             x, starts, r = x + change, starts + turn, there
             damping = max(damping * max(1 / 6, 1 - (2 * ratio - 1) ** 3), least)
-            farthest = AROUND * (abs(float(x[0])) + SURE * abs(float(change[0])))
-            settled = gained < noise * cost or farthest < LEAST * cut.dt
+            earliest = AROUND * (float(x[0]) - SURE * abs(float(change[0])))
+            settled = gained < noise * cost or earliest > -LEAST * cut.dt
         elif linear is not x:
             A, linear = model.columns(x, starts, r), x
         else:
