@@ -138,13 +138,16 @@ def tolerances(texts: Sequence[str], model: mujoco.MjModel) -> Callable[[Array, 
 def judge(model: mujoco.MjModel, given: Mapping[int, Limit], motion: Array, noise: Array) -> Tolerance:
     """Return the tolerance of every degree of freedom: as given, else the larger of NOISES sd and SHARE of the motion.
 
+    Of what turns, SHARE is of one turn at most: after it the joint is where it was.
+
     Args:
         given: {degree of freedom: limit}.
         motion, noise: `[nv]`, range of motion and standard deviation of the noise, rad or m.
     """
-    limit = np.maximum(NOISES * noise, SHARE * motion)
+    units = tuple(length_unit(model, v) for v in range(model.nv))
+    most = np.where(np.array(units) == "rad", 2 * np.pi, np.inf)
+    limit = np.maximum(NOISES * noise, SHARE * np.minimum(motion, most))
     for dof, own in given.items():
         limit[dof] = own.value * motion[dof] if own.relative else own.value
-    units = tuple(length_unit(model, v) for v in range(model.nv))
     user = np.isin(np.arange(model.nv), list(given))
     return Tolerance(Channels.of(model).qvel, units, limit, np.asarray(motion, float), np.asarray(noise, float), user)

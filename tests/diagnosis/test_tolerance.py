@@ -43,6 +43,11 @@ def test_what_is_typed_and_what_is_taken_without(texts, hinge, rail):
     assert own.limit == pytest.approx([hinge, rail]) and own.units == ("rad", "m")
 
 
+def test_of_a_joint_that_turns_round_the_default_is_a_share_of_one_turn():
+    own = request.tolerances([], MODEL)(np.array([300.0, 300.0]), np.array([0.001, 0.01]))
+    assert own.limit == pytest.approx([0.02 * 2 * math.pi, 0.02 * 300.0])
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -82,7 +82,7 @@ class Effort:
     Attributes:
         sets: that a round fits around a set, with one, two and three effects more. Of as many as the first those within
             `margin` are brought to convergence, as many as it has entries may widen their ranges, as many as in all are
-            fitted in lockstep.
+            fitted in lockstep; so many places are screened closely.
         rounds: of whatever is repeated until it gains nothing, at most; steps on some of the windows.
         margin: nats below the leading set, within which a promised set is fitted, and a fit goes on.
         windows: that screening simulates. Half of them rank starts, where there are as many.
