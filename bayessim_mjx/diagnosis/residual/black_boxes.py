@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES, solve
@@ -51,9 +52,12 @@ class Problem:
         return S + np.diag(more), g + np.concatenate([self.pull, 0 * pulled])
 
     def solve(self, A: Array, b: Array) -> Array:
-        """Most probable parameters, within their bounds, and weights."""
-        free = np.full(len(b) - self.k, np.inf)
-        return solve(A, b, np.concatenate([self.low, -free]), np.concatenate([self.high, free]))
+        """Most probable parameters, within their bounds, and weights, which have none and are eliminated first."""
+        k = self.k
+        weights = cho_factor(A[k:, k:])
+        by_parameters, alone = cho_solve(weights, A[k:, :k]), cho_solve(weights, b[k:])
+        p = solve(A[:k, :k] - A[:k, k:] @ by_parameters, b[:k] - A[:k, k:] @ alone, self.low, self.high)
+        return np.concatenate([p, alone - by_parameters @ p])
 
     def features(self, quantities: Sequence[str], seed: int = 0, physics: bool = False) -> Features:
         """Of the logs."""
