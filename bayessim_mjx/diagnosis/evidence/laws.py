@@ -235,22 +235,22 @@ class StandIn:
     Attributes:
         nats: by which the known parameters are likelier; column: of the effect, at one of its points.
         point: `[k]`, its numbers in the best amount; steps: `[k]`, of the fit's numbers that this amount does.
-        parameter: index of the known one that gains most.
+        parameters: indices of the known ones that it brings nearer to the data sheet by more than half of their way.
     """
 
     nats: float
     column: Column
     point: Array
     steps: Array
-    parameter: int
+    parameters: tuple[int, ...]
 
 
 def by_parameters(state: SearchState, answer: Model) -> dict[str, tuple[str, ...]]:
     """List {known parameter: labels of the effects that it may stand for}, without a simulation (`stand_ins`)."""
     out: dict[str, tuple[str, ...]] = {}
     for found in stand_ins(state, answer):
-        name = answer.fit.names[found.parameter]
-        out[name] = (*out.get(name, ()), found.column.candidate.label)
+        for name in (answer.fit.names[i] for i in found.parameters):
+            out[name] = (*out.get(name, ()), found.column.candidate.label)
     return out
 
 
@@ -293,9 +293,9 @@ def _gain(fit: Fit, away: Array, column: Column, steps: Array) -> StandIn:
     amounts = np.append(amounts, 0.0)  # none
     gains = [_far(fit.coordinates, away) - _far(fit.coordinates, away - t * steps) for t in amounts]
     amount = float(amounts[np.argmax(gains)])
-    precision = np.array([c.precision if c.stated or c.kind else 0.0 for c in fit.coordinates])
-    parameter = int(np.argmax(precision * (away**2 - (away - amount * steps) ** 2)))
-    return StandIn(max(gains), column, column.at(amount), amount * steps, parameter)
+    sheet = np.array([bool(c.stated or c.kind) for c in fit.coordinates])
+    near = sheet & (np.abs(away - amount * steps) < 0.5 * np.abs(away))
+    return StandIn(max(gains), column, column.at(amount), amount * steps, tuple(map(int, np.flatnonzero(near))))
 
 
 def _far(coordinates: Sequence[Coordinate], away: Array) -> float:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from bayessim_mjx.diagnosis.phrases.parameters import stand_ins
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.diagnosis.result import Verdict as Title
 from bayessim_mjx.effects.support.words import words
@@ -78,6 +79,11 @@ UNSOUGHT = replace(
     ALIKE,
     advice=f"Randomise over all explanations, or log another motion: {WHOLE} proposes one that separates them.",
 )
+EITHER = replace(
+    VERDICTS["parameters"],
+    advice="Measure a part, such as a link's mass, and state it with --accuracy. Then diagnose again. Until then, "
+    "randomise widely: effects.yaml holds one of the explanations.",
+)
 PARTLY = Verdict(
     "Partly explained",
     "The named effects leave more of the gap than the tolerance.",
@@ -98,6 +104,8 @@ def verdict_of(d: Diagnosis) -> Verdict:
         return REMAINDER
     if d.verdict == "ambiguous" and d.next_experiment.get("name", "none") == "none":
         return ALIKE if d.next_experiment else UNSOUGHT
+    if d.verdict == "parameters" and stand_ins(d.parameters):
+        return EITHER
     if d.verdict == "effects" and lacks(d):
         return replace(VERDICTS["effects"], advice=NOT_IN_MUJOCO)
     found = PARTLY if d.verdict == "unexplained" and d.effects and d.gap.beyond else VERDICTS[d.verdict]

@@ -12,8 +12,8 @@ from bayessim_mjx.quantities import MOST, finite, listed, percent
 STUCK = "At a bound: {named}. They stand in for something missing, or their ranges are too narrow."
 FAR = "Far from the data sheet: {named}."
 STANDS_FOR = (
-    "A wrong data sheet at {parameters} moves the robot in these logs as {effects} would. --accuracy states "
-    "the accuracy of the data sheet."
+    "These logs do not separate a wrong data sheet at {parameters} from {effects}. To separate them, measure such a "
+    "parameter and state it (--accuracy)."
 )
 
 
@@ -70,6 +70,11 @@ def remarks(known: Mapping[str, Mapping[str, Any]]) -> list[str]:
         texts += [f"{name} {p['data_sheet']}." for name, p in far.items()]
     elif far:
         texts.append(FAR.format(named=listed([f"{n} {p['mean']:.4g} ({p['away']:.1f} sd)" for n, p in far.items()])))
-    same = {name: p["same_as"] for name, p in known.items() if p.get("same_as")}
-    labels = [label for each in same.values() for label in each]
-    return texts + ([STANDS_FOR.format(parameters=listed(list(same)), effects=any_of(labels, MOST))] if same else [])
+    same = [f"{name} {p['mean']:.4g}" for name, p in known.items() if p.get("same_as")]
+    return texts + ([STANDS_FOR.format(parameters=listed(same), effects=stand_ins(known))] if same else [])
+
+
+def stand_ins(known: Mapping[str, Mapping[str, Any]]) -> str:
+    """Name the effects that do the same in the logs as known parameters far from the data sheet; "" without any."""
+    labels = dict.fromkeys(label for p in known.values() for label in p.get("same_as") or ())
+    return any_of(list(labels), MOST) if labels else ""

@@ -21,6 +21,10 @@ HEADS = {
     "simulator, {calibrated}.",
     "unexplained": "No effect of the library explains the gap: recalibration leaves {calibrated}.",
 }
+EITHER = (
+    "Either the data sheet is wrong, or the cause is {effects}. These logs do not separate them. Recalibration reduces "
+    "the gap from {nominal} to {calibrated}."
+)
 SMALL = " This exceeds the noise, but is too small to identify a cause."  # where the residual is above the noise
 PARTLY_HEAD = "Partly explained: {named}."
 PART = "The library explains only a part of the gap that recalibration leaves, {calibrated}."
@@ -108,7 +112,11 @@ def _head(d: Diagnosis) -> str:
         quoted = {"no_gap": far.nominal, "parameters": far.calibrated}.get(d.verdict)
         above = quoted is not None and not of_one(quoted**2).at_noise
         head = HEADS["no_gap"].partition(": ")[2] if above and d.verdict == "no_gap" else HEADS[d.verdict]
-        return named.capital((head + SMALL * above).format(**fill)) + _acts(d)
+        instead = parameters.stand_ins(d.parameters) if d.verdict == "parameters" else ""
+        head = EITHER if instead else head
+        far_off = [] if instead or d.verdict != "parameters" else parameters.far_from_model(d.parameters)
+        first = named.capital((head + SMALL * above).format(effects=instead, **fill))
+        return " ".join([first + _acts(d), *far_off])
     if d.verdict == "unexplained":
         gap = of_rms(far.calibrated, far.with_effects)
         head = f"{PARTLY_HEAD} {REST}" if far.beyond else PART if gap.closed > gap.left else HEADS["unexplained"]

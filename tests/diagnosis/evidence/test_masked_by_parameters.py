@@ -39,11 +39,11 @@ def test_the_best_amount_takes_the_whole_deviation_back_and_the_range_bounds_it(
     fit = fit_of("ab", [1.0, 1.5])
     away = fit.values - 1.0
     whole = laws._gain(fit, away, *work((-1.0, 1.0)))
-    assert whole.nats == pytest.approx(laws._far(fit.coordinates, away)) and whole.parameter == 1
+    assert whole.nats == pytest.approx(laws._far(fit.coordinates, away)) and whole.parameters == (1,)
     np.testing.assert_allclose(whole.steps, [0.0, 0.5])
     half = laws._gain(fit, away, *work((-1.0, 0.25)))
     np.testing.assert_allclose(half.steps, [0.0, 0.25])
-    assert 0 < half.nats < whole.nats
+    assert 0 < half.nats < whole.nats and half.parameters == ()  # no more than half of the way
     wrong = laws._gain(fit, away, *work((-1.0, 0.0)))
     assert wrong.nats == 0.0
 

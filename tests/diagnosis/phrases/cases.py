@@ -94,12 +94,18 @@ def every():
     plain = {"structural": "", "data_sheet": "", "nominal": 1.0}
     heavier = {"arm_mass_mult": plain | {"mean": 1.43, "sd": 0.022}, "leg_mass_mult": plain | {"mean": 1.1, "sd": 0.01}}
     few = {"hip": stuck, "arm": far}
+    light = {"mean": 1.33, "sd": 0.33, "nominal": 1.0, "structural": "", "data_sheet": ""}
+    light |= {"same_as": ["actuator_gain@motor"]}
     short = {"minutes": 5.0, "before": 2.0, "parts": ["3 pairs"]}
     chance = {"answer": 0.9, "rivals": 0.08, "nothing": 1e-9}
     return {
         "no gap": made("no_gap", far=gap(NO_EFFECTS, **quiet), above_noise=False),
         "a gap too small to identify": made("no_gap", far=gap(NO_EFFECTS, **loud), above_noise=False),
         "parameters": made("parameters", far=gap(NO_EFFECTS, calibrated=1.1, with_effects=1.1), above_noise=False),
+        "parameters, or an effect": made(
+            "parameters", far=gap(NO_EFFECTS, calibrated=1.1, with_effects=1.1), above_noise=False,
+            parameters={"mass": light, "damping": light},
+        ),
         "parameters and a little": made("parameters", far=gap(NO_EFFECTS, calibrated=1.3, with_effects=1.3)),
         "noise, white": made("noise", noise_memory=0.0),
         "noise with a memory": made("noise", noise_memory=0.06),
