@@ -196,7 +196,9 @@ class Search:
             )
             for s in sorted(stand_ins(self.state, model), key=lambda s: -s.nats)[: EFFORT.sets[0]]
         ]  # fmt: skip
-        if plans and not self.state.settings.budget.over(TOGETHER):
+        if plans and self.state.settings.budget.over(TOGETHER):
+            self.state.skipped["with known parameters, whose intervals are too narrow"] = len(plans)
+        elif plans:
             self._fit(plans, "with known parameters", TOGETHER)
 
     def _at_one_place(self) -> None:
