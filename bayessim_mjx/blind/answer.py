@@ -174,7 +174,7 @@ def _threshold(group: tuple[str, str], curves: Curves, singles: Sequence[Outcome
         words = [amounts.in_words(effect, a, slide) for a in at]
         sign = "<" if amounts.AMOUNTS.get(effect, amounts.OTHER).inverse else ">"
         found["told"] = f"{sign} {words[3]}" if found["beyond"] else words[0]
-        found["interval"] = f"from {words[1]} on" if found["beyond"] else f"{words[1]} to {words[2]}"
+        found["interval"] = "not reached" if found["beyond"] else f"{words[1]} to {words[2]}"
     return found
 
 

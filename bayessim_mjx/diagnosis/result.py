@@ -61,8 +61,9 @@ class Gap:
     """Root mean square of measured minus simulated motion on held-out windows, in units of the measurement noise.
 
     A window has half a second, at least 8 and at most 100 control steps (`fitting.cutting.CUTTING`). With contacts it
-    is halved, twice at most, until the error of the time step is below 5 noises. Each window starts at the measured
-    state. *Stages* are the keys `nominal`, `calibrated`, `with_effects`, `reducible_floor` and `noise_floor`.
+    is halved, twice at most, until the error of the time step is below 5 noises. Each window's start
+    state is fitted to it, within the noise of the sensors. *Stages* are the keys `nominal`, `calibrated`,
+    `with_effects`, `reducible_floor` and `noise_floor`.
 
     Attributes:
         noise_floor: 1, the noise itself.

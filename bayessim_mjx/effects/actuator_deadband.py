@@ -38,7 +38,17 @@ class ActuatorDeadband(Effect):
     separates: ClassVar[str] = "slow ramps and holds with the drive's measured effort in the log"
     witness = EFFORT
     quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("half_width", 0.0, 0.0, 0.2, unit="ctrl", per="command", reach=(0.0, 0.3), grid=(0.01, 0.05, 0.2)),
+        Quantity(
+            "half_width",
+            0.0,
+            0.0,
+            0.2,
+            unit="ctrl",
+            per="command",
+            reach=(0.0, 0.3),
+            grid=(0.01, 0.05, 0.2),
+            half="band",
+        ),
     )
 
     def bind(self, mj_model: mujoco.MjModel, timestep: float, substeps: int) -> Site:

@@ -39,7 +39,7 @@ class Backlash(transmission.OfTransmission, Effect):
     separates: ClassVar[str] = "slow triangles with and without gravity's pre-load, a link-side encoder"
     witness = LINK_ENCODER
     quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("gap", 0.0, 0.0, 0.05, unit="rad", per="travel", reach=(0.0, 0.1), grid=(0.03, 0.1, 0.4)),
+        Quantity("gap", 0.0, 0.0, 0.05, unit="rad", per="travel", reach=(0.0, 0.1), grid=(0.03, 0.1, 0.4), half="play"),
         TEETH,
         transmission.ENCODER,
     )

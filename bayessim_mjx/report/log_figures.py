@@ -66,7 +66,7 @@ def over_time(sheet: Sheet, channels: Sequence[str], most: int, units: Mapping[s
         layout[layout_key(y)] = axis(anchor=x, domain=[1 - (k + 0.95) * high, 1 - (k + 0.26) * high], nticks=4)
         said = f"{TITLES[kind]} {name}" if kind in TITLES else channel
         said += f" ({units[channel]})" if channel in units else ""
-        titles.append(heading(text(said + (", slope of the position" if estimated else ""), 60), x, y))
+        titles.append(heading(text(said + (", estimated" if estimated else ""), 60), x, y))
     margin = {"l": 54, "r": 10, "t": 6, "b": 46}
     return figure(data, WIDTH, 60 + ROW * len(channels), least=PHONE, annotations=titles, margin=margin, **layout)
 

@@ -7,8 +7,8 @@ from typing import Any
 from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
+from bayessim_mjx.diagnosis.phrases.size import below_tiles, no_help, with_effects
 from bayessim_mjx.diagnosis.phrases.verdict import number as noise_sd
-from bayessim_mjx.diagnosis.phrases.verdict import with_effects
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.diagnosis.statistics import of_one
 from bayessim_mjx.quantities import count, finite
@@ -55,6 +55,8 @@ def top(d: Diagnosis, folder: Path) -> dict[str, Any]:
         "advice": verdict.advice,
         "command": command(d, folder),
         "tiles": [{"words": TILES.get(s) or with_effects(d), "colour": STAGE[s], **_tile(d, s)} for s in shown],
+        "size": below_tiles(d) if shown else "",
+        "no_help": no_help(d),
         "warnings": len(d.warnings),
         "open": len(d.warnings) <= OPEN_WARNINGS,
     }
@@ -186,7 +188,9 @@ def _effect(e: FoundEffect) -> dict[str, Any]:
         "title": capital(titled(e.name, e.where)),
         "label": f"{e.name}@{e.where}",
         "sentence": e.sentence,
-        "parameters": [dict(zip(("name", "value"), quantity(k, v), strict=True)) for k, v in e.parameters.items()],
+        "parameters": [
+            dict(zip(("name", "value"), quantity(k, v, e.name), strict=True)) for k, v in e.parameters.items()
+        ],
         "weight": percent(e.weight_among_rivals) if finite(e.weight_among_rivals) else "",
         "closed": percent(e.gap_closed),
         "ci": between(*e.gap_closed_ci),

@@ -7,7 +7,7 @@ from typing import TextIO
 from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
-from bayessim_mjx.diagnosis.phrases.verdict import gap_line
+from bayessim_mjx.diagnosis.phrases.size import gap_line
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.tables import TIE
@@ -79,7 +79,7 @@ def _effects(d: Diagnosis) -> Table:
     header = ["effect", "parameters", closed, "90 % interval", "predicted", "score among rivals"]
     rows = []
     for e in d.effects:
-        found = [quantity(k, v) for k, v in e.parameters.items()]
+        found = [quantity(k, v, e.name) for k, v in e.parameters.items()]
         rows.append(
             [
                 capital(titled(e.name, e.where)),

@@ -93,22 +93,23 @@ def estimate(mean: Any, sd: Any = math.nan, in_unit: str = "") -> str:
     return signs(measured(mean, sd, in_unit))
 
 
-def quantity(name: str, value: Estimate) -> tuple[str, str]:
+def quantity(name: str, value: Estimate, effect: str = "") -> tuple[str, str]:
     """Return a parameter's name and value, see `phrases.effects.quantity`."""
-    title, text = _quantity(name, value)
+    title, text = _quantity(name, value, effect)
     return title, signs(text)
 
 
 def own_number(name: str, value: Any, hinged: bool) -> str:
     """Write a candidate's `<where>.<effect>.<parameter>`, with its unit where all joints are hinges."""
     law, _, key = name.rpartition(".")
+    law = law.rpartition(".")[2]
     if isinstance(value, Mapping):
-        return f"{spelt(key)} {estimate(value.get('mean'), value.get('sd'), value.get('unit', ''))}"
+        return f"{spelt(key, law)} {estimate(value.get('mean'), value.get('sd'), value.get('unit', ''))}"
     if not finite(value) or abs(value) < TINY:
-        return f"{spelt(key)} {number(0 if finite(value) else value)}"
-    kind = library.known(law.rpartition(".")[2]) if hinged else None  # a slide's units are others
+        return f"{spelt(key, law)} {number(0 if finite(value) else value)}"
+    kind = library.known(law) if hinged else None  # a slide's units are others
     units = {q.name: q.unit for q in kind.quantities} if kind else {}
-    return " ".join(quantity(key, Estimate(float(value), math.nan, units.get(key, ""))))
+    return " ".join(quantity(key, Estimate(float(value), math.nan, units.get(key, "")), law))
 
 
 def not_fitted(d: Diagnosis, most: int | None = None) -> list[str]:

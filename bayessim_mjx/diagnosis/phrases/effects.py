@@ -12,7 +12,7 @@ from bayessim_mjx import effects as library
 from bayessim_mjx import quantities
 from bayessim_mjx.diagnosis.correction import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.selection.numbers import ODDS
-from bayessim_mjx.effects.support.words import spelt, words
+from bayessim_mjx.effects.support.words import half_of, spelt, words
 from bayessim_mjx.quantities import MOST, finite, listed, percent
 
 if TYPE_CHECKING:
@@ -91,17 +91,24 @@ def spanned(mean: float, low: float, high: float, unit: str) -> str:
     return f"{size} {unit} (90 %: {least} to {most})"
 
 
-def quantity(name: str, value: Estimate) -> tuple[str, str]:
-    """Return a parameter's name and value; reciprocals turned over (`inverse_limit` 0.5 1/(N m) -> limit 2 N m)."""
+def quantity(name: str, value: Estimate, effect: str = "") -> tuple[str, str]:
+    """Return a parameter's name and value; reciprocals turned over (`inverse_limit` 0.5 1/(N m) -> limit 2 N m).
+
+    Args:
+        effect: whose parameter it is, so that a half is called one (`effects.support.words.spelt`).
+    """
     if name in RECIPROCALS and finite(value.mean) and value.mean > 0:
         mean, bound = value.mean, value.bound
         sd: float | None = value.sd
         if finite(sd) and mean < CLEAR * sd:  # may be 0, and its reciprocal infinite
             mean, sd, bound = mean + CLEAR * sd, None, "at most"
         sd = sd / mean**2 if finite(sd) else sd  # d(1/x) = dx / x^2
+        over, _, under = value.unit.partition("/")
+        under = under.removeprefix("(").removesuffix(")")
+        unit = under if over in ("1", "") else f"{under}/{over}"
         turned = {"at least": "at most", "at most": "at least"}.get(bound, bound)
-        return RECIPROCALS[name], _bounded(measured(1 / mean, sd, _turned(value.unit)), turned)
-    return spelt(name), _bounded(measured(value.mean, value.sd, value.unit), value.bound)
+        return RECIPROCALS[name], _bounded(measured(1 / mean, sd, unit), turned)
+    return spelt(name, effect), _bounded(measured(value.mean, value.sd, value.unit), value.bound)
 
 
 def _bounded(text: str, bound: str) -> str:
@@ -109,12 +116,6 @@ def _bounded(text: str, bound: str) -> str:
     if bound in ("at least", "at most"):
         return f"{bound} {text}"
     return text + {"off": " (off)", "end": " (end of its range)"}.get(bound, "")
-
-
-def _turned(text: str) -> str:
-    over, _, under = text.partition("/")
-    under = under.removeprefix("(").removesuffix(")")
-    return under if over in ("1", "") else f"{under}/{over}"
 
 
 def numbered(effect: FoundEffect) -> str:
@@ -126,10 +127,18 @@ def numbered(effect: FoundEffect) -> str:
     name = own.noun if own.lacks.startswith(WRONG) else own.lacks
     main = _main(effect)
     if len(main) == 1:
-        ((_, value),) = (quantity(k, v) for k, v in main.items())
-        return own.at(effect.where, f"{name} of {value}")
+        return own.at(effect.where, f"{name} of {_size(effect)}")
     numbers = _numbers(effect)
     return own.at(effect.where, name) + (f" ({numbers})" if numbers else "")
+
+
+def _size(effect: FoundEffect) -> str:
+    """Return the one number of an effect; of a half also the whole: `0.02 rad to either side (0.04 rad in all)`."""
+    ((name, value),) = _main(effect).items()
+    text = quantity(name, value)[1]
+    if not half_of(effect.name, name) or value.bound == "off":
+        return text
+    return f"{text} to either side ({quantities.number(2 * value.mean)} {value.unit}".rstrip() + " in all)"
 
 
 def _main(effect: FoundEffect) -> dict[str, Estimate]:
@@ -143,7 +152,7 @@ def _numbers(effect: FoundEffect) -> str:
     """Return the numbers that are clearly away from neutral; a shape's only where the amounts that it shapes are."""
     kind, main = library.known(effect.name), _main(effect)
     shapes = {q.name for q in kind.quantities if q.shape} if kind else set()
-    clear = {k: quantity(k, v) for k, v in main.items() if _clear(effect.name, k, v)}
+    clear = {k: quantity(k, v, effect.name) for k, v in main.items() if _clear(effect.name, k, v)}
     sure = all(k in clear or k in shapes for k in main)
     return ", ".join(" ".join(text) for k, text in clear.items() if sure or k not in shapes)
 
@@ -193,14 +202,14 @@ def _law(effects: Sequence[FoundEffect]) -> str:
     if len(effects) == 1:
         return numbered(effects[0])
     own = words(effects[0].name)
-    each = [own.at(e.where, quantity(*next(iter(_main(e).items())))[1]) for e in effects]
+    each = [own.at(e.where, _size(e)) for e in effects]
     return f"{own.lacks} of {listed(each, most=MOST)}"
 
 
 def line(effect: FoundEffect) -> str:
     """`Coulomb friction at hinge: 0.1497 +- 0.0087 N m`, for a list; several parameters by name."""
-    found = [quantity(k, v) for k, v in effect.parameters.items()]
-    values = [v if len(found) == 1 else f"{k} {v}" for k, v in found]
+    found = [quantity(k, v, effect.name) for k, v in effect.parameters.items()]
+    values = [_size(effect)] if len(found) == 1 else [f"{k} {v}" for k, v in found]
     return capital(titled(effect.name, effect.where)) + (": " + ", ".join(values) if values else "")
 
 

@@ -53,7 +53,7 @@ def less_accurate(found: Mapping[str, tuple[float, float, float]]) -> str:
     ]
     return (
         f"the model's numbers are less accurate than usual: {', '.join(each)}; the intervals allow for it; "
-        "--accuracy fixes it"
+        "with --accuracy you state it yourself"
     )
 
 

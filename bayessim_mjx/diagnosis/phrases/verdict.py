@@ -47,8 +47,8 @@ PROMISED = (
     "{realised} (floor: the noise of the residuals)."
 )
 ELSEWHERE = (
-    "If only the choice leaves it out, {they} {close} {elsewhere}. Both shares may be a little too high: the fits that "
-    "the choice compares had seen every condition."
+    "Chosen without each {one} in turn, but fitted to all, {they} {close} {elsewhere}. Both shares may be a little too "
+    "high. The choice compared models that were fitted to all {held}."
 )
 IN_SAMPLE = "These numbers are in sample: one log is one operating condition, and other conditions may differ."
 WITHIN = "Every joint is within its tolerance. The closest is {within}."
@@ -61,7 +61,10 @@ BEHIND = (
 )
 PAST = "The missing force depends on something else, such as the past of the motion."
 SPLITS = "To separate the explanations, run the next experiment: {name}."
-HIDDEN = "Beside {them} these logs would not show {hidden}: {their} numbers change the motion alike."
+HIDDEN = (
+    "There may also be {hidden}. These logs would not show it: other numbers of the named {effect} give almost "
+    "the same motion."
+)
 BUILDS_UP = (
     "Over whole logs the error is {times} times as large as noise, start and parameters explain. Within {window} it "
     "hardly shows. The law or the simulator's time step is not quite right."
@@ -91,8 +94,8 @@ def sentences(d: Diagnosis) -> list[str]:
     texts += [SPLITS.format(name=d.next_experiment["name"])] if any(a["splits"] for a in ambiguous) else []
     members = {label for a in d.answers for m in a["members"] for label in m["effects"]}
     hidden = [label for label in d.hidden if label not in members]  # a class already says that they are not separated
-    them, their = ("it", "its") if len(d.effects) == 1 else ("them", "their")
-    texts += [HIDDEN.format(them=them, their=their, hidden=named.any_of(hidden, MOST))] if hidden else []
+    effect = "effect" if len(d.effects) == 1 else "effects"
+    texts += [HIDDEN.format(effect=effect, hidden=named.any_of(hidden, MOST))] if hidden else []
     texts += _noise(d)
     if d.verdict == "unexplained" and basis.get("flexible"):
         texts += residual.flexible(basis["flexible"], far.in_sample)
@@ -249,18 +252,6 @@ def stage(far: Gap, name: str) -> str:
         (row,) = far.physical.values()
         return f"{extent(row[name], row['unit'])} ({', '.join([*parts, noises])})"
     return f"{parts[0]} ({noises})" if parts else noises
-
-
-def gap_line(d: Diagnosis) -> str:
-    """Return the three gap numbers on one line of the terminal (the page has tiles, `report.sections`)."""
-    words = {"nominal": "as delivered", "calibrated": "recalibrated", "with_effects": with_effects(d)}
-    known = [s for s in words if finite(getattr(d.gap, s)) and (d.effects or s != "with_effects")]
-    return "Gap: " + ", ".join(f"{stage(d.gap, s)} {words[s]}" for s in known) + "." if known else ""
-
-
-def with_effects(d: Diagnosis) -> str:
-    """Name the stage with the effects: in a headline that names none they are the nearest ones."""
-    return "with the nearest effects" if d.verdict == "unexplained" and not d.gap.beyond else "with the effects"
 
 
 def _worst(far: Gap) -> list[str]:

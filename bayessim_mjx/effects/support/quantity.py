@@ -37,6 +37,7 @@ class Quantity:
         remembered: the range sizes the effect's memory, so that no fit can go beyond it.
         optional: it is an entry of theta only where the effect's `parameters` name it (a range was given, or a
             diagnosis tries it); elsewhere it is neutral.
+        half: the whole that it is half of, which people state: "play"; "" where it is no half.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Quantity:
     stated: bool = False
     remembered: bool = False
     optional: bool = False
+    half: str = ""
 
     @property
     def deviation(self) -> float:

@@ -51,9 +51,19 @@ def words(name: str) -> Words:
     return Words(noun, kind.kind, kind.lacks or noun, kind.separates or _law(kind), kind.witness)
 
 
-def spelt(parameter: str) -> str:
-    """Return the name of a parameter in words: `com_x` -> `centre of mass x`."""
-    return re.sub(r"^com ", "centre of mass ", parameter.replace("_", " "))
+def spelt(parameter: str, effect: str = "") -> str:
+    """Return the name of a parameter in words: `com_x` -> `centre of mass x`.
+
+    Of a half with what it is half of, where its effect is named: `gap` of backlash -> `gap (half of the play)`.
+    """
+    text, whole = re.sub(r"^com ", "centre of mass ", parameter.replace("_", " ")), half_of(effect, parameter)
+    return f"{text} (half of the {whole})" if whole and not text.startswith("half") else text
+
+
+def half_of(effect: str, parameter: str) -> str:
+    """Return the whole that a parameter is half of, which people state; "" where it is no half."""
+    kind = room.known(effect)
+    return next((q.half for q in kind.quantities if q.name == parameter), "") if kind else ""
 
 
 def _law(kind: type[Effect]) -> str:

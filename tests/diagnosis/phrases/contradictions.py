@@ -231,7 +231,7 @@ def _hidden(said: Said) -> Iterator[tuple[str, str]]:
     """Effects that are said not to show, although they are named or stand in the answer's place."""
     members = {f"{e['name']}@{e['where']}" for e in said["effects"]}
     members |= {x for e in said["effects"] for r in e["equivalent_to"] if "weight" in r for x in r["effects"]}
-    listed = re.search(r"these logs would not show ([^:\n]*)", text_of(said))
+    listed = re.search(r"There may also be ([^.\n]*)", text_of(said))
     others = [label for label in said.get("hidden") or [] if label not in members]
     if listed and len(others) < len(said["hidden"]) and len(re.split(r", | or ", listed[1])) > len(others):
         yield "hidden", f"called hidden beside the answer that it is part of: {listed[1]}"

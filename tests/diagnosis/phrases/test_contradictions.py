@@ -55,7 +55,7 @@ def test_no_made_up_result_contradicts_itself(name):
             "A flexible force still predicts a part",
             "predicts",
         ),
-        ("two effects", "Beside them", "missing at hinge, moving backward: +0.41 N m.\nBeside them", "place"),
+        ("two effects", "There may also", "missing at hinge, moving backward: +0.41 N m.\nThere may also", "place"),
     ],
 )
 def test_a_planted_contradiction_is_found(name, before, after, kind):

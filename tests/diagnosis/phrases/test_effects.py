@@ -50,7 +50,8 @@ def test_an_estimate_is_printed_as_it_is_rounded_by_its_uncertainty(value, text)
         (effect("actuator_delay", "m", delay=(0.0213, 0.0011, "s")), "a command delay of 21.3 +- 1.1 ms at m"),
         (effect("actuator_saturation", "m", inverse_limit=(0.5, 0.05, "1/(N m)")),
          "an effort limit of 2.00 +- 0.20 N m at m"),
-        (effect("backlash", "j", gap=(0.05, math.nan, "rad", "at least")), "backlash of at least 0.0500 rad at j"),
+        (effect("backlash", "j", gap=(0.05, math.nan, "rad", "at least")),
+         "backlash of at least 0.0500 rad to either side (0.100 rad in all) at j"),
         # com_x is within its uncertainty of none
         (effect("payload", "tool", mass=(0.99, 0.01, "kg"), com_x=(0.01, 0.1, "m")),
          "an extra payload at tool (mass 0.990 +- 0.010 kg)"),
@@ -62,6 +63,20 @@ def test_an_estimate_is_printed_as_it_is_rounded_by_its_uncertainty(value, text)
 )  # fmt: skip
 def test_an_effect_has_its_place_and_its_numbers(found, text):
     assert effects.lacking([found]) == f"the simulator lacks {text}"
+
+
+def test_a_half_is_never_printed_as_the_whole():
+    play = effect("backlash", "j", gap=(0.01977, 0.00069, "rad"), compliance=(0.001, 0.0001, "rad/(N m)"))
+    other = dataclasses.replace(play, where="k")
+    size = "0.01977 +- 0.00069 rad to either side (0.0395 rad in all)"
+    assert effects.lacking([play]) == f"the simulator lacks backlash of {size} at j"
+    assert effects.lacking([play, other]) == f"the simulator lacks backlash of {size} at j and {size} at k"
+    assert effects.line(play).startswith("Backlash at j: gap (half of the play) 0.01977 +- 0.00069 rad, ")
+    dead = effect("actuator_deadband", "m", half_width=(0.1, 0.01, ""))
+    assert effects.lacking([dead]) == (
+        "the simulator lacks a command deadband of 0.100 +- 0.010 to either side (0.200 in all) at m"
+    )
+    assert effects.line(dead) == "Command deadband at m: 0.100 +- 0.010 to either side (0.200 in all)"
 
 
 def test_numbers_that_the_model_has_wrong_are_no_lack():

@@ -5,7 +5,7 @@ import shlex
 
 import pytest
 
-from bayessim_mjx.diagnosis.phrases import advice, notes, verdict
+from bayessim_mjx.diagnosis.phrases import advice, notes, size, verdict
 from bayessim_mjx.diagnosis.result import VERDICTS, Gap, Place
 from tests.diagnosis.phrases import cases
 from tests.diagnosis.phrases.cases import CLOSED, FRICTION, GAIN, LEVEL, PAYLOAD, gap, made
@@ -64,21 +64,46 @@ def test_an_answer_without_rivals_is_a_class_of_one():
 def test_a_member_of_a_class_is_not_called_hidden_as_well():
     hidden = ["inertial_parameters@tool", "viscous_friction@hinge"]
     text = " ".join(made("ambiguous", [PAYLOAD], hidden=hidden).sentences)
-    assert "would not show viscous friction at hinge" in text and text.count("wrong centre of mass") == 1
+    assert "There may also be viscous friction at hinge." in text and text.count("wrong centre of mass") == 1
 
 
 def test_a_gap_within_the_noise_is_called_so():
-    assert verdict.gap_line(made("effects", [FRICTION])) == (
-        "Gap: 1.2 deg (2.1 % of the motion, 21.4 noise sd) as delivered, 0.61 deg (1.1 % of the motion, 10.7 noise sd) "
-        "recalibrated, 0.050 deg (0.087 % of the motion, 0.87 noise sd, within the noise) with the effects."
+    assert size.gap_line(made("effects", [FRICTION])) == (
+        "Gap over 0.5 s: 1.2 deg (2.1 % of the motion, 21.4 noise sd) as delivered, 0.61 deg (1.1 % of the motion, "
+        "10.7 noise sd) recalibrated, 0.050 deg (0.087 % of the motion, 0.87 noise sd, within the noise) with the "
+        "effects."
     )
-    assert "with the effects" not in verdict.gap_line(made("parameters"))
+    assert "with the effects" not in size.gap_line(made("parameters"))
+
+
+def whole(name, **sizes):
+    """The horizon of whole logs."""
+    return {"name": name, "over_likely": 1.0, "physical": {"hinge": sizes | {"unit": "rad"}}}
+
+
+def test_the_gap_has_its_time_and_that_of_whole_logs():
+    row = whole("whole log", nominal=0.138, calibrated=0.05, with_effects=0.001)
+    text = size.gap_line(made("effects", [FRICTION], gap(horizons=[{"name": "0.5 s"}, row])))
+    assert text.startswith("Gap over 0.5 s: 1.2 deg")
+    assert text.endswith(" Over whole logs: 7.9 deg as delivered, 2.9 deg recalibrated, 0.057 deg with the effects.")
+    short = made("effects", [FRICTION], gap(horizons=[row | {"name": "up to 3.2 s"}]))
+    assert "Over simulations of up to 3.2 s: 7.9 deg" in size.gap_line(short)
+
+
+@pytest.mark.parametrize(
+    ("nominal", "calibrated", "words"),
+    [(21.4, 10.7, ""), (10.0, 11.0, size.NO_HELP), (0.98, 0.99, size.QUIET), (1.0, 0.99, "")],
+)
+def test_a_recalibration_that_does_not_help_is_said(nominal, calibrated, words):
+    found = made("effects", [FRICTION], gap(nominal=nominal, calibrated=calibrated))
+    assert size.no_help(found) == words and size.gap_line(found).endswith(words or "with the effects.")
+    assert size.below_tiles(found) == f"These gaps are of windows of 0.5 s. {words}".strip()
 
 
 def test_effects_that_the_headline_does_not_name_are_the_nearest():
     far = dataclasses.replace(LEVEL, with_effects=6.0, closed=LEVEL.closed | {"realised": -0.03})
     found = made("unexplained", [FRICTION], far)
-    assert "noise sd) with the nearest effects" in verdict.gap_line(found)
+    assert "noise sd) with the nearest effects" in size.gap_line(found)
     assert "in turn, the effect closes 0 %" in " ".join(found.sentences)
 
 
