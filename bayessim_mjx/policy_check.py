@@ -33,7 +33,7 @@ def _parser() -> cli.PlainParser:
 
 
 def _policy(argv: Sequence[str] | None) -> int:
-    """Compare logs of a deployed policy with its file; exit code 0 (right), 1 (it differs, or is unknown), 2 (bad input)."""
+    """Compare logs of a deployed policy with its file; exit code 0 (right), 1 (not shown to be), 2 (bad input)."""
     args = _parser().parse_args(argv)
     if args.out:
         cli.writable(Path(args.out).parent, "--out")
