@@ -27,7 +27,7 @@ def nearest(given: str, names: Iterable[str], n: int = 3, cutoff: float = 0.6) -
 
 
 def either(names: Sequence[str]) -> str:
-    """`a, b or c`."""
+    """Return `a, b or c`."""
     return " or ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)
 
 
