@@ -1,7 +1,7 @@
 """Errors that are the user's to mend: the commands print them in one line, without a traceback."""
 
 import errno
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 # What the system refuses for reasons outside of this program: the disk is full, a folder may not be written, a name is
 # too long. (An OSError of another kind, such as a file that ought to be there, is a bug.)
@@ -24,11 +24,6 @@ def nearest(given: str, names: Iterable[str], n: int = 3, cutoff: float = 0.6) -
     import difflib  # here, so that commands start fast
 
     return difflib.get_close_matches(given, list(names), n, cutoff)
-
-
-def either(names: Sequence[str]) -> str:
-    """Return `a, b or c`."""
-    return " or ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)
 
 
 def unknown(what: str, given: str, allowed: Iterable[str], page: str = "") -> UserError:

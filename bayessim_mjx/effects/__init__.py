@@ -19,7 +19,8 @@ from typing import Any
 
 from bayessim_mjx import trust
 from bayessim_mjx.effects.effect import Effect, Quantity
-from bayessim_mjx.errors import UserError, either
+from bayessim_mjx.errors import UserError
+from bayessim_mjx.quantities import listed
 
 __all__ = ["Effect", "known", "load", "make", "names", "recorded", "spec_of"]
 
@@ -95,7 +96,7 @@ def recorded(spec: str) -> type[Effect]:
             raise UserError(f"effect {spec!r}: its package cannot be imported: {error}") from error
         return _checked(kind, spec, spec)
     close = likely(str(spec))
-    hint = f"did you mean {either(close)}? {LIST}" if close else f"there are: {', '.join(names())} ({LIST})"
+    hint = f"did you mean {listed(close, 'or')}? {LIST}" if close else f"there are: {', '.join(names())} ({LIST})"
     raise UserError(f"no effect {spec!r}; {hint}; or a file: path.py:MyEffect")
 
 
