@@ -29,7 +29,7 @@ def test_the_time_of_all_cases_is_said_before_the_start(tmp_path: Path) -> None:
     assert estimate(check, Limits(100, workers=2)).startswith(
         "100 cases x 32 s / 2 workers: about 26 min 40 s (recorded"
     )
-    assert estimate(check, Limits(100, cluster="tcp://head:8786")) == "100 cases to do"
+    assert estimate(check, Limits(100, workers=None, cluster="tcp://head:8786")) == "100 cases to do"
     assert estimate(Check(str(tmp_path), command="mine {out}"), Limits(4, 300.0)).startswith("4 cases to do; --minutes")
     for index, seconds in enumerate((50, 60, 100)):
         check.answer(index).mkdir(parents=True)
