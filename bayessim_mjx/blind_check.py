@@ -53,7 +53,11 @@ def _cases(group: Any) -> None:
     """Which cases there are, and how many at a time."""
     text = "effects to hide, separated by commas (default: all that a diagnosis tries unasked)"
     group.add_argument("--effects", metavar="LIST", default="all", help=text)
-    group.add_argument("--cases", metavar="N", type=cli.whole(1, MOST), default=CASES, help="cases in all")
+    text = (
+        "cases in all. Each takes a worker about half a minute with one or two joints, and up to ten minutes with six. "
+        "The command says the whole time before it starts"
+    )
+    group.add_argument("--cases", metavar="N", type=cli.whole(1, MOST), default=CASES, help=text)
     text = "begin no further case after this time; the next start goes on (default: no limit)"
     group.add_argument("--minutes", metavar="M", type=cli.positive("minutes"), help=text)
     text = "standard deviation of data-sheet values (default: 5%%)"
@@ -91,7 +95,7 @@ def _blind(argv: Sequence[str] | None) -> int:
     args = _parser().parse_args(argv)
     _checked(args)
     from bayessim_mjx.blind.check import Check, effects_of
-    from bayessim_mjx.blind.runner import Limits, run
+    from bayessim_mjx.blind.runner import Limits, estimate, run
     from bayessim_mjx.monitor.console import Console
     from bayessim_mjx.progress import stages
 
@@ -105,6 +109,7 @@ def _blind(argv: Sequence[str] | None) -> int:
     from bayessim_mjx.blind import answer, show
 
     with stages(args.headless) as say:
+        say.line(estimate(check, limits))
         outcomes = run(check, limits, say, lambda so_far: answer.write(check, answer.answer(check, so_far)))
         found = answer.answer(check, outcomes, say)
     with Console(headless=args.headless) as console:

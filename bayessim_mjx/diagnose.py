@@ -75,9 +75,11 @@ def _search(group: Any) -> None:
     """Add the flags for the search and its time."""
     text = (
         "effects to try, separated by commas: names, path.py:Class, or all that are on offer (default: all; "
-        "docs/effects.md says which ones are tried only where named)"
+        "--list_effects says which ones are tried only where named)"
     )
     group.add_argument("--effects", metavar="LIST", default="all", help=text)
+    text = "print the effects of the library, their places and meanings, and stop"
+    group.add_argument("--list_effects", action="store_true", help=text)
     text = "time limit: the search is cut down to it, and the result lists effects that were not tried"
     group.add_argument("--minutes", metavar="M", type=cli.positive("minutes"), help=f"{text} (default: no limit)")
     group.add_argument("--quick", action="store_true", help="a first answer: fewer windows and effects, no maps")
@@ -149,6 +151,16 @@ def _names(effects: str) -> str | list[str]:
     return "all" if names == ["all"] else names
 
 
+def _listed() -> int:
+    """Print name, kind of place and meaning of every effect."""
+    from bayessim_mjx.effects.support.words import listing
+
+    rows = [("effect", "place", "meaning"), *listing()]
+    wide, kind = (max(len(row[k]) for row in rows) for k in (0, 1))
+    print("\n".join(f"{name:{wide}}  {place:{kind}}  {text}" for name, place, text in rows))
+    return 0
+
+
 def _reported(result: "Diagnosis", out: str | Path, verdict_only: bool, missed: Any, say: Show) -> None:
     """Write what is for people: the report and TensorBoard; after `verdict_only` an earlier report goes."""
     from bayessim_mjx import report
@@ -163,6 +175,8 @@ def _reported(result: "Diagnosis", out: str | Path, verdict_only: bool, missed: 
 
 def _diagnose(argv: Sequence[str] | None) -> int:
     args = _parser().parse_args(argv)
+    if args.list_effects:
+        return _listed()
     _checked(args)
     missed = recall(args.blind) if args.blind else beside(args.data)
     setup_jax(Config(task="", device=args.device, cache_dir=args.cache_dir))

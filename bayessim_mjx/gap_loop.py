@@ -19,7 +19,8 @@ from bayessim_mjx.device import setup_jax
 from bayessim_mjx.errors import UserError
 
 DESCRIPTION = (
-    "Measure how much return a diagnosed gap costs, and how much retraining on the corrected simulator recovers."
+    "Measure how much return a diagnosed gap costs, and how much retraining on the corrected simulator recovers. "
+    "Policies need a reward: your own robot needs a task (--task file.py:Class, docs/own_task.md), not a model alone."
 )
 WITHOUT = ("--max_iterations", "--video", "--video_length", "--video_interval", "--logger", "--logdir", "--name")
 

@@ -3,6 +3,7 @@
 import argparse
 import errno
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from bayessim_mjx.errors import UserError
 if TYPE_CHECKING:
     from bayessim_mjx.logs.importers.ros import Choice
     from bayessim_mjx.logs.importers.streams import Recording
+    from bayessim_mjx.logs.overview import Overview
 
 FORMATS = {
     "from-mcap": "MCAP files with ROS 2 messages",
@@ -187,6 +189,8 @@ def _checked(args: argparse.Namespace) -> int:
 
     path = Path(args.path)
     found = overview(path, _model(args), args.map)
+    if found.logs:
+        _gated(args, found)
     _table(("column", "channel", "unit", "values", "note"), found.columns)
     _table(("file", "rows", "length", "rate", "jitter", "gaps"), found.files)
     for note in found.notes:
@@ -201,6 +205,26 @@ def _checked(args: argparse.Namespace) -> int:
             " ".join(["nothing is missing; next: bayessim-mjx diagnose --model", args.model, *own, "--data", str(path)])
         )
     return 2 if found.faults else 0
+
+
+def _gated(args: argparse.Namespace, found: "Overview") -> None:
+    """Add what the gate of a diagnosis says of the logs: refused where no log passes, else notes."""
+    from bayessim_mjx.diagnosis.fitting import robot
+    from bayessim_mjx.diagnosis.logcheck import gate
+    from bayessim_mjx.diagnosis.setup import control_period
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of the model, which a diagnosis says
+            own = robot.of_file(args.model, None, args.drive, args.packages)
+        said = gate.check(found.logs, own.mj_model, control_period(own, found.logs))
+    except UserError as error:
+        found.refused.append(str(error))
+        return
+    if not said.usable:
+        found.refused += [f"{name}: {reason}" for name, reason in said.refused.items()]
+        return
+    found.notes += [text for text in (*said.warnings, *said.findings) if text not in found.notes]
 
 
 def _shown(args: argparse.Namespace) -> int:

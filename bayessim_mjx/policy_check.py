@@ -33,10 +33,11 @@ def _parser() -> cli.PlainParser:
 
 
 def _policy(argv: Sequence[str] | None) -> int:
-    """Compare logs of a deployed policy with its file; exit code 0 (right), 1 (it differs), 2 (bad input)."""
+    """Compare logs of a deployed policy with its file; exit code 0 (right), 1 (not shown to be), 2 (bad input)."""
     args = _parser().parse_args(argv)
     if args.out:
         cli.writable(Path(args.out).parent, "--out")
+    from bayessim_mjx.contract import words
     from bayessim_mjx.contract.check import check
 
     given, golden = (Path(path) if path else None for path in (args.manifest, args.golden))
@@ -45,7 +46,7 @@ def _policy(argv: Sequence[str] | None) -> int:
     if args.out:
         Path(args.out).write_text(json.dumps(_facts(result), indent=1) + "\n", encoding="utf-8")
         print(f"written: {args.out}")
-    return 1 if result.findings else 0
+    return 1 if result.findings or not words.shows(result) else 0
 
 
 def _channels(args: Any) -> Any:
@@ -91,7 +92,7 @@ def _facts(result: Any) -> dict[str, Any]:
     from bayessim_mjx.contract import words
 
     return {
-        "verdict": "differs" if result.findings else "right",
+        "verdict": "differs" if result.findings else "right" if words.shows(result) else "not compared",
         "findings": [asdict(f) | {"sentence": f"{words.where(f)}: {words.sentence(f)}"} for f in result.findings],
         "compared": result.compared,
         "cannot_be_told": {name: words.WHY[reason] for name, reason in result.untold.items()},

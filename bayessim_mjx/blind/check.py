@@ -68,7 +68,7 @@ class Check:
     def __post_init__(self) -> None:
         for name in self.effects:
             if name not in KNOWN:
-                raise unknown("--effects:", name, sorted(KNOWN), "docs/effects.md")
+                raise unknown("--effects:", name, sorted(KNOWN), "`bayessim-mjx diagnose --list_effects`")
 
     def anywhere(self) -> "Check":
         """Name every file by its full path, for processes in other folders and on machines that share the disk."""

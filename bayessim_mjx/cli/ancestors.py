@@ -49,6 +49,7 @@ INSTEAD = {
     "--compute_device_id": "use --device cuda:N",
     "--torch_deterministic": "a run on a CPU is repeatable bit for bit in any case",
     "--deterministic": "a run on a CPU is repeatable bit for bit in any case",
+    "--model": "policies need a task: --task NAME or --task file.py:Class makes one of a model (docs/own_task.md)",
     "--randomize": "train has it; main always draws the physics, and play does by --physics",
     "--train_env_cfg": "use --checkpoint RUN: its task and settings are taken up; --cfg_env FILE for others",
     "--ray_proc_id": "leave it out: runs of one second have folders of their own",

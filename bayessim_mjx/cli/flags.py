@@ -142,6 +142,8 @@ class Parser(PlainParser):
     def parse(self, argv: Sequence[str] | None) -> argparse.Namespace:
         """Namespace with the flags, `overrides`, and `given` (flags that were used)."""
         argv = list(sys.argv[1:] if argv is None else argv)
+        if argv and commands.name_of(argv[0]) in commands.COMMANDS:
+            self._refuse(argv[0])  # before --help shows this command's
         args, rest = self.parse_known_args(argv)
         for text in rest:
             self._refuse(text)

@@ -201,6 +201,11 @@ NOTES = {
     "log_is_normalised": "the log holds normalised observations; the actions fit them",
 }
 
+NOTHING = (
+    "error: nothing of observations, actions and commands could be compared. Log observation:<name> and "
+    "action:<actuator> while the robot moves, with the names in the file, and check again (docs/export.md)"
+)
+
 
 def sentence(finding: Finding) -> str:
     """One line of what differs, without the name of the entry."""
@@ -261,13 +266,18 @@ def note(text: str) -> str:
     return NOTES[key]
 
 
+def shows(result: Result) -> bool:
+    """Whether anything of observations, actions and commands was compared."""
+    return any(result.compared.get(part) for part in ("observation", "action", "command"))
+
+
 def verdict(result: Result) -> str:
     """Write the last line."""
     if result.findings:
         n = len(result.findings)
         return f"{n} thing{'s' if n > 1 else ''} of the deployed policy differ{'' if n > 1 else 's'} from its file"
-    if not any(result.compared.get(part) for part in ("observation", "action", "command")):
-        return "nothing of observations, actions and commands could be compared"
+    if not shows(result):
+        return NOTHING
     if "rebuilt_unlike" in result.notes:
         return "the log does not show whether the policy is deployed as its file says"
     return "the deployed policy is as its file says, in all that the log shows"

@@ -13,17 +13,25 @@ import importlib.metadata
 import inspect
 import keyword
 import pkgutil
+import re
 from pathlib import Path
 from typing import Any
 
 from bayessim_mjx import trust
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.quantities import listed
 
 __all__ = ["Effect", "known", "load", "make", "names", "recorded", "spec_of"]
 
 ENTRY_POINTS = "bayessim_mjx.effects"
 _brought: dict[str, type[Effect]] = {}  # by name: the newest of those that files and packages brought
+LIST = "`bayessim-mjx diagnose --list_effects` lists all"
+SAME = {"motor": "actuator", "drive": "actuator", "latency": "delay", "stiction": "friction", "dry": "coulomb"}
+USUAL = {  # of several effects with this word, the one that is meant most often
+    "friction": "coulomb_friction", "gain": "actuator_gain", "delay": "actuator_delay", "damping": "viscous_friction",
+    "play": "backlash", "spring": "joint_spring", "mass": "payload",
+}  # fmt: skip
 KINDS = ("actuator", "joint", "body", "geom", "world")
 
 
@@ -87,9 +95,20 @@ def recorded(spec: str) -> type[Effect]:
         except (Exception, SystemExit) as error:
             raise UserError(f"effect {spec!r}: its package cannot be imported: {error}") from error
         return _checked(kind, spec, spec)
-    close = difflib.get_close_matches(str(spec), names())
-    hint = f"did you mean {close[0]}? docs/effects.md lists all" if close else f"there are: {', '.join(names())}"
+    close = likely(str(spec))
+    hint = f"did you mean {listed(close, 'or')}? {LIST}" if close else f"there are: {', '.join(names())} ({LIST})"
     raise UserError(f"no effect {spec!r}; {hint}; or a file: path.py:MyEffect")
+
+
+def likely(spec: str) -> list[str]:
+    """At most three effects that a user may mean by an unknown name, the likeliest first: by words, then by letters."""
+    given = [SAME.get(word, word) for word in re.split(r"[\W_]+", spec.lower()) if word]
+    own = {name: set(name.split("_")) for name in names()}
+    first = [USUAL.get("_".join(given), "_".join(given))]
+    within = [name for name, words in own.items() if words <= set(given)]
+    around = [name for name, words in own.items() if given and set(given) <= words]
+    close = difflib.get_close_matches(spec, own)
+    return [name for name in dict.fromkeys([*first, *within, *around, *close]) if name in own][:3]
 
 
 def known(name: str) -> type[Effect] | None:

@@ -49,6 +49,7 @@ class Overview:
         notes: warnings and questions.
         missing: channels that the logs need; refused: why they cannot be read. Both have to be mended.
         map_text: the map that was proposed, "" where there is one.
+        logs: as a diagnosis reads them, where nothing has to be mended.
     """
 
     columns: list[tuple[str, ...]] = field(default_factory=list)
@@ -57,6 +58,7 @@ class Overview:
     missing: list[str] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     map_text: str = ""
+    logs: list[Log] = field(default_factory=list)
 
     @property
     def faults(self) -> list[str]:
@@ -264,8 +266,8 @@ def _read(out: Overview, files: Sequence[Path], log_map: LogMap, model: mujoco.M
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            logs = read_logs(files, model, log_map, partial=True)
-            out.notes += list(dict.fromkeys(text for log in logs if (text := _order(log, model))))
+            out.logs = list(read_logs(files, model, log_map, partial=True))
+            out.notes += list(dict.fromkeys(text for log in out.logs if (text := _order(log, model))))
         except UserError:
             out.refused += [text for text in (_refusal(file, log_map, model) for file in files) if text]
     out.notes += list(dict.fromkeys(str(w.message) for w in said))

@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import yaml
+
 from bayessim_mjx.config import Config
 from bayessim_mjx.monitor.clock import reference
-from bayessim_mjx.quantities import compact
+from bayessim_mjx.parameters.reading import GROUPS
+from bayessim_mjx.quantities import MOST, compact, listed
 
 # references (`clock.reference`) that the first start of `main --task Pendulum` spends on tracing and compiling; source:
 # benchmarks/records/clock.json
 COMPILES = 200
+PLACES = {kind: group for group, (kind, _) in GROUPS.items() if kind in ("body", "geom", "joint", "tendon", "actuator")}
 NAMES = {"jax": "MJX's JAX implementation", "warp": "MuJoCo Warp"}
 
 
@@ -19,7 +23,7 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
     """List {what: value} for `Console.start`; `infers`: the outer loop, else PPO alone."""
     lines: dict[str, Any] = {"task": f"{config.task}, {'adaptive domain randomisation' if infers else 'PPO alone'}"}
     if infers or config.randomization.get("randomize"):
-        lines["parameters"] = [_range(p) for p in env.space.parameters] or "none"
+        lines["parameters"] = [_range(p) for p in env.space.parameters] or _none(config)
     if config.domain is not None:
         lines["drawn from"] = config.domain
     if infers:
@@ -38,6 +42,22 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
     note = f"the first start compiles its programs{most}, later starts load them from the cache"
     lines |= {"seed": config.seed, "note": note}
     return lines
+
+
+def _none(config: Config) -> str:
+    """Say that nothing is drawn, and how what a diagnosis recalibrated would be."""
+    first = next((p for p in config.calibrated if p.get("kind") in PLACES), None)
+    if first is None:
+        return "none"
+    span = {"range": [first["low"], first["high"]], "operation": first["operation"], "include": [first["target"]]}
+    own = {"actor_params": {"robot": {PLACES[first["kind"]]: {first["attribute"]: span}}}}
+    text = yaml.safe_dump({"task": {"randomization_params": own}}, default_flow_style=True, sort_keys=False, width=1e9)
+    names = listed([str(p["name"]) for p in config.calibrated], most=MOST)
+    return (
+        f"none. The effects.yaml has no uncertain effects; its uncertainty is in the recalibrated parameters: {names}. "
+        "They stay at their means, because this task does not randomise them. To draw one with the mean and error of "
+        f"the file, give --cfg_env FILE with `{text.strip()}` (docs/effects.md)"
+    )
 
 
 def _range(p: Any) -> str:

@@ -115,6 +115,18 @@ def write_pendulum_logs(folder: Path) -> None:
         np.savetxt(folder / f"run{i}.csv", np.column_stack(columns), delimiter=",", header=header, comments="")
 
 
+@pytest.mark.parametrize("command", [["main"], ["train"], ["gap-loop"]])
+def test_the_help_of_another_command_is_not_that_of_this_one(command: list[str], capsys: pytest.CaptureFixture) -> None:
+    assert main.main([*command, "logs", "--help"]) == 2
+    out = capsys.readouterr()
+    assert "'logs' is a command of its own: " in out.err and not out.out
+
+
+def test_a_model_in_the_place_of_a_task_is_refused_with_the_way_on(capsys: pytest.CaptureFixture) -> None:
+    assert main.main(["gap-loop", "--model", "robot.xml", "--diagnosis", "found"]) == 2
+    assert "--task file.py:Class" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_real_process_on_logs_survives_sigkill(tmp_path: Path) -> None:
     """kill -9 after the first checkpoint, --resume: the last checkpoint is that of an unkilled run, and it plays."""

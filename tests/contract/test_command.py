@@ -36,6 +36,16 @@ def test_a_difference_is_1_and_is_written(policy: Path, tmp_path: Path, capsys: 
     assert facts["verdict"] == "differs" and facts["findings"][0]["kind"] == "scale_twice"
 
 
+def test_a_log_that_shows_nothing_is_1_with_a_way_on(
+    policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    log = robots.write_log(tmp_path / "logs" / "run.csv", drop=("observation", "action", "qpos", "qvel"))
+    assert run(policy, "--logs", log, "--out", tmp_path / "found.json") == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert "error: nothing of observations" in out and "Log observation:<name> and action:<actuator>" in out, out
+    assert json.loads((tmp_path / "found.json").read_text())["verdict"] == "not compared"
+
+
 def test_bad_input_is_2(policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     log = robots.write_log(tmp_path / "logs" / "run.csv")
     assert run(tmp_path / "none.onnx", "--logs", tmp_path / "logs") == 2

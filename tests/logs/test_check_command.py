@@ -174,3 +174,36 @@ def test_commands_that_fit_the_other_joint_are_noted(tmp_path: Path, capsys: pyt
     assert "the commands m_shoulder, m_elbow fit the motion far better as those of m_elbow, m_shoulder" in out, out
     _, out = check(capsys, logs_of(tmp_path, np.c_[t, q, q], HEADER), "--model", model_of(tmp_path))
     assert "far better" not in out
+
+
+def moved(seconds: float = 4.0) -> np.ndarray:
+    """[T, 5]: time, two torques, two angles of the arm that they drive."""
+    data, table = mujoco.MjData(MODEL), []
+    for k in range(int(100 * seconds)):
+        t = 0.01 * k
+        data.ctrl[:] = np.sin(4 * t) - 0.3 * data.qvel[0], 0.4 * np.sin(6 * t) - 0.1 * data.qvel[1]
+        table.append([t, *data.ctrl, *data.qpos])
+        mujoco.mj_step(MODEL, data, 2)
+    return np.array(table)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [([1, 1, 1, 1, 1], ""), ([1, -1, -1, 1, 1], "the opposite sign"), ([1, 1, 1, 40, 1], "unexplained by any model")],
+    ids=["right", "mirrored", "unit"],
+)
+def test_what_a_diagnosis_refuses_by_the_model_is_refused_here(
+    tmp_path: Path, capsys: pytest.CaptureFixture, change: list[float], said: str
+) -> None:
+    folder = logs_of(tmp_path, moved() * np.array(change), HEADER)
+    code, out = check(capsys, folder, "--model", model_of(tmp_path))
+    assert code == (2 if said else 0), out
+    assert ("nothing is missing" in out) is not bool(said)
+    assert not said or ("refused: run.csv: effort unrelated" in out and said in out), out
+
+
+def test_a_log_that_a_diagnosis_leaves_out_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    logs_of(tmp_path, moved(), HEADER)
+    folder = logs_of(tmp_path, moved() * np.array([1, -1, -1, 1, 1]), HEADER, "wrong.csv")
+    code, out = check(capsys, folder, "--model", model_of(tmp_path))
+    assert code == 0 and "note: wrong.csv: refused: effort unrelated" in out and "nothing is missing" in out

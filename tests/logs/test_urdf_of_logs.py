@@ -1,5 +1,9 @@
 """Logs of a robot whose model is a URDF without actuators."""
 
+import math
+
+import mujoco
+
 from bayessim_mjx import import_logs
 
 URDF = """<robot name="r"><link name="base"/>
@@ -13,7 +17,12 @@ def test_a_check_names_drives_and_carries_them_on(tmp_path, capsys):
     model, logs = tmp_path / "r.urdf", tmp_path / "logs"
     model.write_text(URDF)
     logs.mkdir()
-    rows = "".join(f"{0.02 * k:.2f},{0.1 * (k % 7):.1f},{0.003 * k**2 % 1:.4f}\n" for k in range(60))
+    arm, rows = mujoco.MjModel.from_xml_string(URDF), ""
+    data = mujoco.MjData(arm)
+    for k in range(200):
+        data.qfrc_applied[0] = 0.2 * math.sin(0.1 * k) + 0.1 * math.sin(0.23 * k) - 0.02 * float(data.qvel[0])
+        rows += f"{0.02 * k:.2f},{data.qfrc_applied[0]:.6f},{data.qpos[0]:.6f}\n"
+        mujoco.mj_step(arm, data, 10)
     (logs / "a.csv").write_text("time,ctrl:elbow,qpos:elbow\n" + rows)
     given = ["check", str(logs), "--model", str(model)]
     assert import_logs.main(given) == 2

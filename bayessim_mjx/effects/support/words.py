@@ -51,6 +51,16 @@ def words(name: str) -> Words:
     return Words(noun, kind.kind, kind.lacks or noun, kind.separates or _law(kind), kind.witness)
 
 
+def listing() -> list[tuple[str, str, str]]:
+    """(name, kind of place, one line) of every effect."""
+    found = []
+    for name in room.names():
+        kind = room.load(name)
+        apart = "only for training" if kind.random else "" if kind.offered else "only where --effects names it"
+        found.append((name, kind.kind, words(name).noun + (f" ({apart})" if apart else "")))
+    return found
+
+
 def spelt(parameter: str, effect: str = "") -> str:
     """Return the name of a parameter in words: `com_x` -> `centre of mass x`.
 
