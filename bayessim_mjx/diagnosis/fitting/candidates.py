@@ -158,7 +158,7 @@ def stack(kinds: Sequence[type[Effect]], scales: Scales) -> tuple[tuple[Effect, 
             except UserError as error:
                 whys.append(str(error))
         why = whys[0].removeprefix(f"{kind.name}: ") if found else f"these logs excite no suitable {kind.kind}"
-        if found or (every and not kind.floats):
+        if found or (every and not kind.floats and not kind.loop):
             without.setdefault(why, []).append(kind.name)
     names = [scales.model.joint(int(j)).name for j in scales.model.dof_jntid]
     pairs = [(names[i], names[k]) for i, k in scales.follows.items()]
