@@ -12,6 +12,7 @@ from bayessim_mjx.quantities import compact
 # references (`clock.reference`) that the first start of `main --task Pendulum` spends on tracing and compiling; source:
 # benchmarks/records/clock.json
 COMPILES = 200
+NO_NOISE = "the surrogate has no sensor noise: its posterior will be sharper than a robot's; set real.noise"
 NAMES = {"jax": "MJX's JAX implementation", "warp": "MuJoCo Warp"}
 
 
@@ -27,6 +28,8 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
         drawn = "" if config.env.realParams is not None else ", drawn by the seed (env.realParams sets them)"
         surrogate = f"surrogate: the simulator at hidden parameters{drawn}"
         lines["real side"] = f"recorded motion in {logs}" if logs else surrogate
+        if _exact(config, env):
+            lines["noise"] = NO_NOISE
     lines["budget"] = _budget(config, infers)
     if infers and config.bayessim.modelClass is not None:
         lines["inference"] = _inference(config.bayessim)
@@ -38,6 +41,13 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
     note = f"the first start compiles its programs{most}, later starts load them from the cache"
     lines |= {"seed": config.seed, "note": note}
     return lines
+
+
+def _exact(config: Config, env: Any) -> bool:
+    """Whether the posterior is that of a surrogate whose sensors add nothing."""
+    infers = config.bayessim.modelClass is not None and len(env.space) > 0
+    drawn = getattr(getattr(env, "nuisance", None), "observations", None)  # noise of the task's own section
+    return infers and not config.real.logs and not config.real.noise and drawn is None
 
 
 def _range(p: Any) -> str:
