@@ -51,6 +51,7 @@ class Watched:
             self.save(step, tree, meta=loop.meta_of(state))
 
     def part(self, round_: int, name: str) -> None:
+        self.stop.when = "at the end of this round, which may take minutes"
         self.session.part(round_, name)
 
     def round(self, info: Any, policy: Any) -> None:
@@ -70,6 +71,7 @@ class Watched:
         self.run.save(step, tree, evaluation=evaluation, meta=clock, supersede=supersede)
         if not self.parts.finished(tree["state"]):
             self.stop.check()
+            self.stop.when = cli.Stop.when
 
 
 def _parser() -> cli.Parser:

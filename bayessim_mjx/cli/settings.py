@@ -44,9 +44,12 @@ def _drawn() -> int:
 def resumed_config(args: argparse.Namespace, config: Config, also: Sequence[str] = ()) -> Config:
     """Return the settings of the run to resume; only devices, cache and videos may change.
 
+    The run's own task may be named: that allows its file.
+
     also: further flags that the command takes; it sees to what they set.
     """
-    fixed = [flag for flag in args.given if flag not in (*RESUMABLE, *also)] + list(args.overrides)
+    same = ("--task",) if args.task and task_name(args.task) == config.task else ()
+    fixed = [flag for flag in args.given if flag not in (*RESUMABLE, *same, *also)] + list(args.overrides)
     if fixed:
         raise UserError(f"--resume goes on with the run's own settings, which {fixed[0]} would change; start a new run")
     video = {k: getattr(args, k) for k in ("video_length", "video_interval", "video") if getattr(args, k) is not None}

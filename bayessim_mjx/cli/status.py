@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bayessim_mjx import trust
 from bayessim_mjx.cli.ends import one_line
 from bayessim_mjx.config import Config
 from bayessim_mjx.errors import UserError, disk_is_full
@@ -20,9 +21,10 @@ if TYPE_CHECKING:
 
 
 class Stop:
-    """Ctrl-C (or SIGTERM) asked for: `requested` is looked at where the state is whole."""
+    """Ctrl-C (or SIGTERM) asked for: `requested` is looked at where the state is whole, `when` says when that is."""
 
     requested = False
+    when = "after this step"
 
     def check(self) -> None:
         """End here if a stop was asked for."""
@@ -45,7 +47,7 @@ def graceful() -> Iterator[Stop]:
         if stop.requested:
             raise KeyboardInterrupt
         stop.requested = True
-        print("\nstopping after this step, with a checkpoint (again: at once)", file=sys.stderr)
+        print(f"\nstopping {stop.when}, with a checkpoint (again: at once)", file=sys.stderr)
 
     if threading.current_thread() is threading.main_thread():
         before = {n: signal.signal(n, ask) for n in (signal.SIGINT, signal.SIGTERM)}
@@ -91,7 +93,7 @@ def running(run: "Run", say: Callable[[str], Any]) -> Iterator[None]:
         run.set_status("finished")
     except KeyboardInterrupt:
         run.set_status("interrupted")
-        say(f"interrupted; go on with --resume {run.path}")
+        say(f"interrupted; go on with --resume {run.path}{trust.flags()}")
         raise
     except Exception as error:
         full = disk_is_full(error)
@@ -99,6 +101,6 @@ def running(run: "Run", say: Callable[[str], Any]) -> Iterator[None]:
             run.set_status("failed", "the disk is full" if full else f"{type(error).__name__}: {error}")
         if full:
             why = one_line(error)
-            advice = f"make room and go on with --resume {run.path}"
+            advice = f"make room and go on with --resume {run.path}{trust.flags()}"
             raise UserError(f"{run.path}: the disk is full ({why}); {advice}") from error
         raise

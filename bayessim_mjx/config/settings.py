@@ -342,7 +342,7 @@ class BayesSimConfig(Section):
     )  # fmt: skip
     realEvals: int = setting(100, "surrogate-real episodes that score the policy each round", low=1, high=COUNT)
     realTrajs: int = setting(1, "real trajectories used for inference each round (they accumulate)", low=1, high=COUNT)
-    realIters: int = setting(100, "rounds of the outer loop", low=1, high=COUNT)
+    realIters: int = setting(5, "rounds of the outer loop", low=1, high=COUNT)
     untilSettled: bool = setting(
         False,
         "end before realIters after a round that left the posterior as it was: another would train on the same physics",

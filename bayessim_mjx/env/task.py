@@ -247,6 +247,9 @@ class Task(Env):
     ) -> tuple[Drawn | None, Observations]:
         limit = self.observation_clip[self.variant]
         obs = {name: _finite(value) for name, value in self.observe(world, data, action).items()}
+        if (names := len(self.observation_names)) != (numbers := obs["policy"].size):
+            counts = f"{names} observation_names for an observation of {numbers} numbers"
+            raise UserError(f"{self.name} has {counts}: name each number once")
         if self.nuisance is not None and drawn is not None:  # a critic of its own sees the truth
             if not drawn.observation.size:
                 drawn = self.nuisance.seen(drawn, obs["policy"].shape[0])

@@ -185,7 +185,7 @@ def with_surrogate(config: Config, env: Env) -> Config:
 def real_parameters(
     settings: Any, space: ParameterSpace, ends: tuple[np.ndarray, np.ndarray] | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """weights [K], means [K, d], sds [K, d] of `env.realParams`; a one-number list stands for every parameter.
+    """weights [K], means [K, d], sds [K, d] of `env.realParams`; one number of `stds` stands for every parameter.
 
     Means lie in the ranges of `space`, or where these may move within `ends`, (lowest, highest) [d].
 
@@ -260,14 +260,14 @@ def _row(key: str, row: Any, space: ParameterSpace, rest: np.ndarray) -> np.ndar
         known = zip(space.names, rest, strict=True)
         return np.asarray([_number(f"{key}.{name}", row.get(name, value)) for name, value in known])
     numbers = [_number(f"{key}[{i}]", value) for i, value in enumerate(row)]
-    if len(numbers) == 1:
+    if len(numbers) == 1 and key.startswith("stds"):
         return np.full(len(space), numbers[0])
     model = [i for i, p in enumerate(space.parameters) if p.kind != "effect"]  # the first of theta
     if len(row) == len(model):
         return np.asarray([*numbers, *rest[len(model) :]])
     if len(row) != len(space):
         raise UserError(
-            f"env.realParams.{key} has {len(row)} numbers, the task has {len(space)} parameters: "
+            f"env.realParams.{key} has {len(row)} number{'s' * (len(row) > 1)}, the task has {len(space)} parameters: "
             f"{', '.join(space.names)}"
         )
     return np.asarray(numbers)

@@ -16,6 +16,7 @@ from bayessim_mjx.quantities import MOST, compact, listed
 # benchmarks/records/clock.json
 COMPILES = 200
 PLACES = {kind: group for group, (kind, _) in GROUPS.items() if kind in ("body", "geom", "joint", "tendon", "actuator")}
+NO_NOISE = "the surrogate has no sensor noise: its posterior will be sharper than a robot's; set real.noise"
 NAMES = {"jax": "MJX's JAX implementation", "warp": "MuJoCo Warp"}
 
 
@@ -31,6 +32,8 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
         drawn = "" if config.env.realParams is not None else ", drawn by the seed (env.realParams sets them)"
         surrogate = f"surrogate: the simulator at hidden parameters{drawn}"
         lines["real side"] = f"recorded motion in {logs}" if logs else surrogate
+        if _exact(config, env):
+            lines["noise"] = NO_NOISE
     lines["budget"] = _budget(config, infers)
     if infers and config.bayessim.modelClass is not None:
         lines["inference"] = _inference(config.bayessim)
@@ -58,6 +61,13 @@ def _none(config: Config) -> str:
         "They stay at their means, because this task does not randomise them. To draw one with the mean and error of "
         f"the file, give --cfg_env FILE with `{text.strip()}` (docs/effects.md)"
     )
+
+
+def _exact(config: Config, env: Any) -> bool:
+    """Whether the posterior is that of a surrogate whose sensors add nothing."""
+    infers = config.bayessim.modelClass is not None and len(env.space) > 0
+    drawn = getattr(getattr(env, "nuisance", None), "observations", None)  # noise of the task's own section
+    return infers and not config.real.logs and not config.real.noise and drawn is None
 
 
 def _range(p: Any) -> str:

@@ -22,11 +22,16 @@ def test_main_stops_only_after_the_rounds_checkpoint() -> None:
     """A stop that is asked for during inference comes while the round is reported, before it is saved."""
     calls: list = []
     wall = types.SimpleNamespace(mark=lambda: 7)
-    session = types.SimpleNamespace(round=lambda *_: calls.append("round"), flush=lambda: None, wall=wall)
+    session = types.SimpleNamespace(part=lambda *_: None, flush=lambda: None, wall=wall)
+    session.round = lambda *_: calls.append("round")
     run = types.SimpleNamespace(save=lambda step, tree, *, meta, **_: calls.append((step, meta["seconds"])))
     stop = cli.Stop()
     parts = types.SimpleNamespace(finished=lambda state: state.round == 2)
     watched = main.Watched(session, stop, run, parts)
+    watched.part(0, "simulate")
+    assert "end of this round, which may take minutes" in stop.when
+    watched.save(4, {"state": types.SimpleNamespace(round=1)}, meta={})
+    assert calls.pop() == (4, 7) and stop.when == "after this step"  # the next round trains
     stop.requested = True
     watched.round(None, None)
     with pytest.raises(KeyboardInterrupt):

@@ -12,7 +12,7 @@ ROWS = "expected one row per component, a list of numbers for mass, length"
 MEANS = {"means": [[1.0, 0.5]]}
 
 
-def test_lists_mappings_and_one_number_are_rows():
+def test_lists_mappings_and_one_standard_deviation_are_rows():
     weights, means, sds = real_parameters(
         {"means": [["1e0", 0.5], {"length": 1, "mass": 2}], "stds": [[0.1], 2 * [0]]}, SPACE
     )
@@ -38,6 +38,8 @@ def test_the_ends_of_a_range_are_in_it():
         ({"means": "a"}, rf"realParams\.means = 'a': {ROWS}"),
         ({"means": [[]]}, rf"realParams\.means\[0\] = \[\]: {ROWS}"),
         ({"means": [1.0, [0.5]]}, rf"realParams\.means\[0\] = 1\.0: {ROWS}"),
+        ({"means": [[1.0]]}, r"realParams\.means\[0\] has 1 number, the task has 2 parameters: mass, length"),
+        ({"means": [[1.0, 1.0, 1.0]]}, r"means\[0\] has 3 numbers, the task has 2 parameters: mass, length"),
         ({"means": [["a", 1.0]]}, r"realParams\.means\[0\]\[0\] = 'a': expected a number"),
         ({"means": {"mass": "a", "length": 1}}, r"realParams\.means\[0\]\.mass = 'a': expected a number"),
         ({"means": [[True, 1.0]]}, r"means\[0\]\[0\] = True: expected a number"),

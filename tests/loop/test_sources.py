@@ -53,7 +53,7 @@ def test_a_tenth_of_the_randomized_actions_is_random_and_each_world_has_its_own_
     assert mixed.var() == pytest.approx(expected, rel=0.1)
 
 
-def test_one_number_stands_for_every_parameter_and_names_may_be_used():
+def test_one_standard_deviation_stands_for_every_parameter_and_names_may_be_used():
     weights, means, sds = sources.real_parameters({"means": [[1.0, 0.5, 0.2]], "stds": [[0.01]]}, SPACE)
     np.testing.assert_allclose(weights, [1.0])
     np.testing.assert_allclose(means, [[1.0, 0.5, 0.2]])

@@ -1,5 +1,6 @@
 """A task named by its file, `path/slider.py:Slider`, or by the entry point of an installed package."""
 
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,38 @@ def test_the_flag_names_it_with_the_settings_beside_it(slider: str, tmp_path: Pa
     assert env.name == "Slider" and opening(config, env, jax.devices()[0])["task"].startswith(config.task)
 
 
+def test_a_surrogate_without_sensor_noise_is_announced(slider: str) -> None:
+    def noted(*overrides: str, **more: Any) -> bool:
+        config = config_of("--task", slider, *overrides)
+        return "noise" in opening(config, registry.make(slider, config=config), jax.devices()[0], **more)
+
+    assert noted() and noted("real.noise=0")
+    assert not noted("real.noise=0.01") and not noted("real.logs=logs") and not noted("bayessim.modelClass=None")
+    assert not noted(infers=False)
+    own = {"observations": {"range": [0, 0.01], "operation": "additive", "distribution": "gaussian"}}
+    mass = {"slider": {"rigid_body_properties": {"mass": {"range": [0.5, 2.0], "operation": "scaling"}}}}
+    for params, known in (({}, True), (own, False)):
+        section = {"randomization_params": {"actor_params": mass, **params}}
+        Path("slider.yaml").write_text(json.dumps({"task": section}))
+        assert noted() is known
+
+
+def test_the_hint_to_resume_allows_the_file_and_the_same_task_may_be_named(slider: str, monkeypatch: Any) -> None:
+    monkeypatch.setattr(trust, "_named", set())
+    config, heard = config_of("--task", slider), []
+    run = runs.Run.create("logs", config.task, "", config, [])
+    with pytest.raises(KeyboardInterrupt), cli.running(run, heard.append):
+        raise KeyboardInterrupt
+    file = Path("slider.py").resolve()
+    assert heard == [f"interrupted; go on with --resume {run.path} --allow_code {file}"]
+    monkeypatch.setattr(trust, "_named", set())  # another process
+    parser = cli.Parser("main", "", resume=True)
+    again = cli.resumed_config(parser.parse(["--task", slider, "--resume", str(run.path)]), run.config)
+    assert again == run.config and registry.make(again.task, config=again).name == "Slider"
+    with pytest.raises(UserError, match="--task would change"):
+        cli.resumed_config(parser.parse(["--task", "Pendulum", "--resume", str(run.path)]), run.config)
+
+
 def test_the_ranges_of_the_class_hold_under_randomize(slider: str) -> None:
     config = config_of("--task", slider, "task.randomize=True")
     assert registry.make(config.task, config=config).space.names == ("block_mass_mult",)
@@ -109,6 +142,11 @@ def test_a_run_of_it_lies_under_its_name_and_asks_before_it_runs_the_file(slider
         ("slider.py:XML", SLIDER, ["no subclass of bayessim_mjx.Task"]),
         ("slider.py:Slider", SLIDER.replace("def observe", "def look"), ["lacks the methods observe"]),
         ("slider.py:Slider", SLIDER.replace("control_dt = 0.02", ""), ["lacks `control_dt`"]),
+        (
+            "slider.py:Slider",
+            SLIDER.replace('("position", "velocity")', '("position", "velocity", "force")'),
+            ["Slider has 3 observation_names for an observation of 2 numbers"],
+        ),
         ("slider.py:Slider", "import nonsense\n", ["slider.py, line 1", "nonsense"]),
         ("slider.py:Slider", "def (:\n", ["slider.py, line 1", "SyntaxError"]),
     ],
