@@ -95,7 +95,7 @@ def test_without_time_the_first_answer_says_what_was_not_tried(setup, monkeypatc
     """The clock strikes whenever it is read: the first effect is fitted, the others have no time."""
     clock = itertools.count()
     monkeypatch.setattr(successive_halving, "EFFORT", dataclasses.replace(successive_halving.EFFORT, sets=(1,)))
-    short = searched(setup, seconds=30.0, now=lambda: float(next(clock)))
+    short = searched(setup, seconds=27.0, now=lambda: float(next(clock)))
     assert short.answer.label == SPRING and len(short.state.cut_short) == 2
     assert not_fitted(short.state) == {phrases.NO_TIME_LEFT: sorted(short.state.cut_short, key=labels(setup).index)}
     assert "2 single effects" in not_tried(short.state)["parts"]

@@ -9,6 +9,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.fitting.candidates import Coordinate, _probes
 from bayessim_mjx.diagnosis.request import Request
+from bayessim_mjx.diagnosis.selection.numbers import EFFORT
 from bayessim_mjx.diagnosis.selection.screen import screen
 from bayessim_mjx.diagnosis.setup import prepare
 from bayessim_mjx.effects.speed_torque_limit import SpeedTorqueLimit
@@ -97,11 +98,12 @@ def test_where_time_ends_first_every_candidate_was_looked_at_before_any_a_second
     """The middle of each grid comes first, then points far from it; with time for all the result is the same."""
     truth, setup, fitter, fit, whole = screened
     module = importlib.import_module("bayessim_mjx.diagnosis.selection.screen")
-    monkeypatch.setattr(module, "EFFORT", replace(module.EFFORT, sets=(1,)))
     each = max(fitter.simulator.lanes // len(fit.r), 1)
     count = len(setup.candidates)
     looks = -(-count // each) + 1  # parts, of which the last ones begin the second round
     for wanted in (looks, None):
+        few = replace(EFFORT, sets=(1,)) if wanted else EFFORT  # of which one call simulates few
+        monkeypatch.setattr(module, "EFFORT", few)
         secants, left = module.Secants(), iter(range(wanted or 10**6))
         found = screen(fitter, fit, setup.candidates, secants=secants, over=lambda left=left: next(left, None) is None)
         sizes = [len(secants.columns[c.label]) for c in setup.candidates]
@@ -114,6 +116,18 @@ def test_where_time_ends_first_every_candidate_was_looked_at_before_any_a_second
         for candidate in setup.candidates:
             first = secants.columns[candidate.label][0].point
             np.testing.assert_array_equal(first, candidate.probes[len(candidate.probes) // 2])
+
+
+def test_candidates_are_simulated_at_all_points_only_at_the_places_that_gain_most(screened, monkeypatch):
+    """With room for one place it is that of the truth, or one that does the same."""
+    truth, setup, fitter, fit, whole = screened
+    module = importlib.import_module("bayessim_mjx.diagnosis.selection.screen")
+    monkeypatch.setattr(module, "EFFORT", replace(EFFORT, sets=(1,)))
+    secants = module.Secants()
+    found = screen(fitter, fit, setup.candidates, secants=secants)
+    deep = {c.where for c in setup.candidates if len(secants.columns[c.label]) > 1}
+    assert deep == {found[0].candidate.where} == {whole[0].candidate.where}
+    assert len(found) == len(whole)
 
 
 def test_what_was_simulated_on_one_fit_is_projected_on_another_without_a_simulation(screened):
