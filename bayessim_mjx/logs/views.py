@@ -6,7 +6,6 @@ Everything is bounded: long logs are decimated for pictures, and spectra are mea
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +21,7 @@ from bayessim_mjx.logs.files import map_of_folder
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.mapping import LogMap
 from bayessim_mjx.logs.overview import Overview, overview
-from bayessim_mjx.logs.read import files_of, read_logs, table_of
+from bayessim_mjx.logs.read import files_of, table_of
 
 STREAMS = ("ctrl", "qpos", "qvel", "effort")
 SEGMENT = 256  # rows of a segment of a spectrum: 2.6 s at 100 Hz; a rule of thumb
@@ -74,15 +73,12 @@ def view(path: Path, model: mujoco.MjModel | None, map_file: str | None = None) 
         UserError: no such file or folder, nothing in it that can be a log, a map that is wrong.
     """
     out = View(overview(path, model, map_file))
-    own = map_file or map_of_folder(path)
-    log_map = LogMap.read(own) if own is not None else _proposed(out.overview)
     if model is not None and not out.overview.faults:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the overview has them as notes
-            out.sheets = [_sheet(log) for log in read_logs(files_of(path, log_map), model, log_map, partial=True)]
+        out.sheets = [_sheet(log) for log in out.overview.logs]
         out.units = units_of(model)
     else:
-        out.sheets = _as_written(path, log_map)
+        own = map_file or map_of_folder(path)
+        out.sheets = _as_written(path, LogMap.read(own) if own is not None else _proposed(out.overview))
     if model is not None:
         out.limits, out.pairs = _limits(model), _driven(model)
     if not out.sheets:

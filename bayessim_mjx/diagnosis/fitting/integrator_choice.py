@@ -104,7 +104,7 @@ class Choice:
     Attributes:
         robot: with the integrator of the diagnosis; stable: its coarsest stable step.
         cuts, worth: the windows, and the error of the time step in them.
-        better: told of an integrator that is more accurate than the model's.
+        better: why no more accurate integrator than the model's is used, where one would matter.
     """
 
     robot: Robot

@@ -115,10 +115,10 @@ def _head(d: Diagnosis) -> str:
         quoted = {"no_gap": far.nominal, "parameters": far.calibrated}.get(d.verdict)
         above = quoted is not None and not of_one(quoted**2).at_noise
         head = HEADS["no_gap"].partition(": ")[2] if above and d.verdict == "no_gap" else HEADS[d.verdict]
-        instead = parameters.stand_ins(d.parameters) if d.verdict == "parameters" else ""
-        head = EITHER if instead else head
-        far_off = [] if instead or d.verdict != "parameters" else parameters.far_from_model(d.parameters)
-        first = named.capital((head + SMALL * above).format(effects=instead, **fill))
+        known = d.parameters if d.verdict == "parameters" else {}
+        instead = parameters.stand_ins(known)
+        far_off = [] if instead else parameters.far_from_model(known)
+        first = named.capital(((EITHER if instead else head) + SMALL * above).format(effects=instead, **fill))
         return " ".join([first + _acts(d), *far_off])
     if d.verdict == "unexplained":
         gap = of_rms(far.calibrated, far.with_effects)
