@@ -6,7 +6,7 @@ from elsewhere comes to rest far from them: a payload's place hardly moves anyth
 **Hidden** (`by_effects`). A bias beside a spring moves the spring's angle of rest; viscous friction beside friction by
 direction is part of it. Such logs do not tell whether both are there: the named law stands for both.
 
-**Stand-ins** (`by_parameters`). A joint's viscous friction is its damping, rotor inertia beside a slide is its mass, a
+**Stand-ins** (`stand_ins`). A joint's viscous friction is its damping, rotor inertia beside a slide is its mass, a
 drive's gain is all of the robot's inertia, damping and friction together. The prior decides whether the data sheet is
 wrong or an effect is missing.
 """
@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from bayessim_mjx.diagnosis.data_sheet import SURE
-from bayessim_mjx.diagnosis.fitting.candidates import Candidate, Coordinate
+from bayessim_mjx.diagnosis.evidence.parameters import unlikely
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial
 from bayessim_mjx.diagnosis.selection.models import Model
@@ -235,33 +235,21 @@ class StandIn:
     Attributes:
         nats: by which the known parameters are likelier; column: of the effect, at one of its points.
         point: `[k]`, its numbers in the best amount; steps: `[k]`, of the fit's numbers that this amount does.
-        parameters: indices of the known ones that it brings nearer to the data sheet by more than half of their way.
     """
 
     nats: float
     column: Column
     point: Array
     steps: Array
-    parameters: tuple[int, ...]
-
-
-def by_parameters(state: SearchState, answer: Model) -> dict[str, tuple[str, ...]]:
-    """List {known parameter: labels of the effects that it may stand for}, without a simulation (`stand_ins`)."""
-    out: dict[str, tuple[str, ...]] = {}
-    for found in stand_ins(state, answer):
-        for name in (answer.fit.names[i] for i in found.parameters):
-            out[name] = (*out.get(name, ()), found.column.candidate.label)
-    return out
 
 
 def stand_ins(state: SearchState, answer: Model) -> list[StandIn]:
-    """Find effects that known parameters may stand for.
+    """Find effects that known parameters may stand for, without a simulation.
 
-    An effect stands beside a parameter's deviation where known parameters do all its work (`HIDDEN`), and
-    where the data sheet speaks for it: without the effect's part the parameters are so much likelier that the odds
-    against the effect, one of all candidates and in its best size, are below `ODDS.strong`, and by `ODDS.mention` at
-    least. Beside the best one stand those that the data sheet does not speak strongly against; then what it leaves is
-    looked at in the same way.
+    Known parameters do all their work (`HIDDEN`). Without the effect's part the parameters are so much likelier that
+    the odds against the effect, one of all candidates and in its best size, are below `ODDS.strong`, and by
+    `ODDS.mention` at least. Beside the best one stand those that the data sheet does not speak strongly against; then
+    the rest is looked at in the same way. Whether one stands beside the answer, the evidence of its fit decides.
     """
     columns = state.secants.of(c for c in state.candidates if all(compatible(c, e) for e in answer.effects))
     columns = [c for c in columns if c.way.any()]
@@ -271,7 +259,7 @@ def stand_ins(state: SearchState, answer: Model) -> list[StandIn]:
     project = Projection(fit)
     works = [(c, steps) for c in columns if (steps := project.taken(c.change, HIDDEN)) is not None]
     least = max(-state.log_prior(frozenset("x")) - np.log(ODDS.strong), np.log(ODDS.mention))
-    away, out = fit.values - np.array([c.neutral for c in fit.coordinates]), list[StandIn]()
+    away, out = fit.away, list[StandIn]()
     while works:
         gains: dict[str, StandIn] = {}
         for column, steps in works:
@@ -291,22 +279,6 @@ def _gain(fit: Fit, away: Array, column: Column, steps: Array) -> StandIn:
     """In its best amount, of parameters so far from the data sheet `[k]`; steps: that do the work of the column."""
     amounts = np.array([end * AMOUNTS for end in column.room if np.isfinite(end)]).ravel()
     amounts = np.append(amounts, 0.0)  # none
-    gains = [_far(fit.coordinates, away) - _far(fit.coordinates, away - t * steps) for t in amounts]
+    gains = [unlikely(fit.coordinates, away) - unlikely(fit.coordinates, away - t * steps) for t in amounts]
     amount = float(amounts[np.argmax(gains)])
-    sheet = np.array([bool(c.stated or c.kind) for c in fit.coordinates])
-    near = sheet & (np.abs(away - amount * steps) < 0.5 * np.abs(away))
-    return StandIn(max(gains), column, column.at(amount), amount * steps, tuple(map(int, np.flatnonzero(near))))
-
-
-def _far(coordinates: Sequence[Coordinate], away: Array) -> float:
-    """Minus the log prior density of known parameters so far from the data sheet, up to a constant.
-
-    Of a kind whose accuracy nobody stated a multivariate Student t (`accuracy`), of stated ones a Gaussian.
-    """
-    squares = np.array([c.precision for c in coordinates]) * away**2
-    kinds = np.array([c.kind for c in coordinates])
-    total = 0.5 * float(squares[[c.stated and not c.kind for c in coordinates]].sum())
-    for kind in {k for k in kinds if k}:
-        own = squares[kinds == kind]
-        total += 0.5 * (SURE + len(own)) * float(np.log1p(own.sum() / SURE))
-    return total
+    return StandIn(max(gains), column, column.at(amount), amount * steps)

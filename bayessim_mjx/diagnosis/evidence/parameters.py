@@ -95,7 +95,7 @@ def posterior(fit: Fit, curvature: Array, pull: Array | None = None) -> Posterio
     found = tuple(sorted({c.kind for c in coordinates if c.kind}))  # whose accuracy is inferred
     own = np.array([[c.kind == kind for c in coordinates] for kind in found]).reshape(len(found), len(coordinates))
     stated = np.array([c.precision for c in coordinates])
-    away = np.array([c.neutral for c in coordinates]) - fit.values
+    away = -fit.away
     shares = np.array(list(itertools.product(LEVELS, repeat=len(found))))
     factor = (ACCURACY / shares) ** 2  # [M, K], of precisions
     precision = stated * np.where(own.any(0), factor @ own, 1.0)  # [M, k]
@@ -116,6 +116,20 @@ def posterior(fit: Fit, curvature: Array, pull: Array | None = None) -> Posterio
     return Posterior(found, shares, weight / weight.sum(), fit.values + move, covariance, whole)
 
 
+def unlikely(coordinates: Sequence[Coordinate], away: Array) -> float:
+    """Minus the log prior density of known parameters so far from the data sheet `[k]`, up to a constant.
+
+    Of a kind whose accuracy nobody stated a multivariate Student t, of stated ones a Gaussian.
+    """
+    squares = np.array([c.precision for c in coordinates]) * away**2
+    kinds = np.array([c.kind for c in coordinates])
+    total = 0.5 * float(squares[[c.stated and not c.kind for c in coordinates]].sum())
+    for kind in {k for k in kinds if k}:
+        own = squares[kinds == kind]
+        total += 0.5 * (SURE + len(own)) * float(np.log1p(own.sum() / SURE))
+    return total
+
+
 @dataclass(frozen=True, eq=False)
 class Integrated:
     """A model's evidence.
@@ -134,10 +148,9 @@ class Integrated:
 
 def belief_of(fit: Fit) -> Belief:
     """Return the prior of a fit's step, with the data sheet's accuracies as the fit believes them."""
-    neutral = np.array([c.neutral for c in fit.coordinates])
     low = np.array([c.low for c in fit.coordinates]) - fit.values
     high = np.array([c.high for c in fit.coordinates]) - fit.values
-    return Belief(fit.belief(), neutral - fit.values, low, high)
+    return Belief(fit.belief(), -fit.away, low, high)
 
 
 def integrated(fit: Fit, learnt: Learnt, effects: Sequence[Mapping[int, bool]] = ()) -> Integrated:

@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 
 from bayessim_mjx.diagnosis.evidence import doubts
 from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, Windows, learn, marginal, windows_of
-from bayessim_mjx.diagnosis.evidence.parameters import Integrated, Posterior, belief_of, integrated
+from bayessim_mjx.diagnosis.evidence.parameters import Integrated, Posterior, belief_of, integrated, unlikely
 from bayessim_mjx.diagnosis.fitting import forces as disturbance
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection import heldout
@@ -30,32 +30,35 @@ Array = NDArray[np.float64]
 class Weighed:
     """Posterior probabilities of the sets that were fitted, most likely first.
 
-    A set with irrelevant effects is no explanation of its own: it counts for the set without them (`core`). Known
+    A set with irrelevant effects is no explanation of its own: it counts for the set without them (`core`). An effect
+    that does the work of known parameters is relevant where these lie far from the data sheet without it. Known
     parameters are averaged over the sets as they are, as an irrelevant effect may take a part of their values.
 
     Attributes:
         weight: {explanation: probability}; nats: {explanation: log of evidence and prior over those of the known
             parameters alone}. numbers: {set: free numbers of its effects}.
         sets: {set: probability}, every one by itself.
-        excess: {set: held-out squared error above the noise, in noise variances}.
+        left: {set: what its model leaves}.
     """
 
     weight: Mapping[Key, float]
     nats: Mapping[Key, float]
     numbers: Mapping[Key, int]
     sets: Mapping[Key, float]
-    excess: Mapping[Key, float]
+    left: Mapping[Key, Left]
 
     @property
     def answer(self) -> Key:
         """Of the sets that are as likely as the most likely one (`Odds.mention`), that with the fewest numbers.
 
         No effects that leave a relevant gap which others of them close: their evidence may rest on one of `doubts`,
-        such as a late sensor, that no simulator gets.
+        such as a late sensor, that no simulator gets. No effect without which only known parameters move: the logs do
+        not separate it from a wrong data sheet, however probable it is.
         """
-        likely = self._within(ODDS.mention)
-        limit = min(self.excess[k] for k in likely) + _relevant(self.excess)
-        closing = [k for k in likely if not k or self.excess[k] <= limit]
+        likely, top = self._within(ODDS.mention), next(iter(self.weight))
+        limit = min(self.left[k].excess for k in likely) + _relevant(self.left)
+        closing = [k for k in likely if not k or self.left[k].excess <= limit]
+        closing += [k for k in self.weight if k < top and self.left[k].excess <= limit]
         return min(closing, key=lambda k: (len(k), self.numbers[k], -self.weight[k], sorted(k)))
 
     @property
@@ -68,6 +71,13 @@ class Weighed:
         """The sets by themselves that the evidence does not speak strongly against, and the answer."""
         best = max(self.sets.values())
         return list(dict.fromkeys([self.answer, *(k for k, w in self.sets.items() if w * ODDS.strong >= best)]))
+
+    def chance(self) -> dict[str, float]:
+        """Probabilities of the answer with or without more, of its rivals, and of the known parameters alone."""
+        answer = [k for k in self.weight if self.answer <= k] if self.answer else [BASE]
+        rivals = [k for k in self.beside if k not in answer]
+        each = {"answer": answer, "rivals": rivals, "nothing": [BASE]}
+        return {name: sum(self.weight.get(k, 0.0) for k in some) for name, some in each.items()}
 
     def to_dicts(self) -> list[dict[str, Any]]:
         """Return the sets with 99.9 % of the probability, and the known parameters alone, for JSON."""
@@ -83,35 +93,48 @@ class Weighed:
         return [k for k, w in self.weight.items() if w * odds >= best]
 
 
-def core(key: Key, excess: Mapping[Key, float]) -> Key:
-    """Return the smallest subset of a set that leaves no relevant part of the gap more than the set.
+@dataclass(frozen=True)
+class Left:
+    """What a set's model leaves.
+
+    Attributes:
+        excess: held-out squared error above the noise, in noise variances.
+        unlikely: minus the log prior density of its known parameters, in nats (`parameters.unlikely`).
+    """
+
+    excess: float
+    unlikely: float = 0.0
+
+
+def core(key: Key, left: Mapping[Key, Left]) -> Key:
+    """Return the smallest subset of a set that does as well: neither gap nor known parameters are relevantly farther.
 
     Args:
-        excess: {set: held-out squared error above the noise, in noise variances}, of all sets that were fitted.
+        left: of all sets that were fitted.
     """
-    limit = excess[key] + _relevant(excess)
-    enough = [k for k in excess if k <= key and excess[k] <= limit]
-    return min(enough, key=lambda k: (len(k), excess[k], sorted(k)))
+    limit, unlikely = left[key].excess + _relevant(left), left[key].unlikely + np.log(ODDS.mention)
+    enough = [k for k in left if k <= key and left[k].excess <= limit and left[k].unlikely <= unlikely]
+    return min(enough, key=lambda k: (len(k), left[k].excess, sorted(k)))
 
 
-def _relevant(excess: Mapping[Key, float]) -> float:
-    """Return the smallest difference in `excess` (see `core`) that is a relevant part of the gap."""
-    return RELEVANCE.noise + RELEVANCE.share * max(excess[BASE], 0.0)
+def _relevant(left: Mapping[Key, Left]) -> float:
+    """Return the smallest difference in `Left.excess` that is a relevant part of the gap."""
+    return RELEVANCE.noise + RELEVANCE.share * max(left[BASE].excess, 0.0)
 
 
 def weighed(
     evidence: Mapping[Key, float],
-    excess: Mapping[Key, float],
+    left: Mapping[Key, Left],
     numbers: Mapping[Key, int],
     candidates: int,
     special: Mapping[Key, Key] = MappingProxyType({}),
 ) -> Weighed:
-    """Return the posterior; `evidence` and `excess` (see `core`) have the empty set, the known parameters alone.
+    """Return the posterior; `evidence` and `left` have the empty set, the known parameters alone.
 
     special: {set: the same with a special case in the place of a law whose further numbers are neutral}: one model.
     """
     total = {k: e + log_prior(k, candidates) for k, e in evidence.items()}
-    own, of = {k: excess[k] for k in evidence}, dict[Key, list[float]]()
+    own, of = {k: left[k] for k in evidence}, dict[Key, list[float]]()
     for key, nats in total.items():
         needed = core(key, own)
         of.setdefault(special.get(needed, needed), []).append(nats - total[BASE])
@@ -196,19 +219,20 @@ class Weighing:
         some = {BASE: 0, self._best(): 0} if self.scored else {}
         return [self.scored[k].learnt.hyper for k in some]
 
-    def excess(self, keys: Iterable[Key]) -> dict[Key, float]:
-        """Held-out squared errors above the likeliest set's noise, in noise variances as estimated from the logs."""
+    def left(self, keys: Iterable[Key]) -> dict[Key, Left]:
+        """Return what sets leave, above the likeliest set's noise, in noise variances as estimated from the logs."""
         floor = float(np.mean(self.scored[self._best()].learnt.hyper.noise ** 2))
         models = {k: self.scored[k].model for k in keys}
-        return {k: m.total / (self.state.noise * len(m.cost)) - floor for k, m in models.items()}
+        squares = {k: m.total / (self.state.noise * len(m.cost)) for k, m in models.items()}
+        return {k: Left(squares[k] - floor, unlikely(m.fit.coordinates, m.fit.away)) for k, m in models.items()}
 
     def _best(self) -> Key:
         return max(self.scored, key=self.total)
 
     def settled(self, key: Key) -> bool:
         """Whether a set of effects leaves nothing that matters."""
-        left = self.excess([key, BASE])
-        return bool(key) and left[key] <= _relevant(left)
+        left = self.left([key, BASE])
+        return bool(key) and left[key].excess <= _relevant(left)
 
     def total(self, key: Key) -> float:
         """Log of evidence and prior over those of the known parameters alone."""
@@ -229,7 +253,7 @@ class Weighing:
 
     def _weighed(self, nats: dict[Key, float]) -> Weighed:
         numbers = {k: sum(len(e.coordinates) for e in s.model.effects) for k, s in self.scored.items()}
-        return weighed(nats, self.excess(self.scored), numbers, len(self.state.candidates), self.special)
+        return weighed(nats, self.left(self.scored), numbers, len(self.state.candidates), self.special)
 
 
 def _without(of: Scored, kept: NDArray[np.bool_], sizes: bool = True) -> float:

@@ -53,6 +53,11 @@ class Fit:
         return tuple(c.name for c in self.coordinates)
 
     @property
+    def away(self) -> Array:
+        """Distance of its numbers from neutral `[k]`: from the data sheet, from no effect."""
+        return np.asarray(self.values - np.array([c.neutral for c in self.coordinates]))
+
+    @property
     def usual(self) -> Array:
         """Steps `[k]` of finite differences where nothing is known of the columns."""
         return np.array([c.step for c in self.coordinates])
@@ -96,10 +101,9 @@ class Fit:
     def prior(self) -> tuple[Array, Array, Array, Array]:
         """(precision, pull, room below, room above), `[k]` each, in units of the cost."""
         precision = self.belief() * np.array([self.doubt if c.stated else 1.0 for c in self.coordinates])
-        neutral = np.array([c.neutral for c in self.coordinates])
         low = np.array([c.low for c in self.coordinates]) - self.values
         high = np.array([c.high for c in self.coordinates]) - self.values
-        return precision, precision * (neutral - self.values), low, high
+        return precision, -precision * self.away, low, high
 
     def belief(self) -> Array:
         """Precision of the priors `[k]` in units of the parameters, for use beside a curvature in nats."""

@@ -57,8 +57,11 @@ def less_accurate(found: Mapping[str, tuple[float, float, float]]) -> str:
     )
 
 
-def remarks(known: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return a sentence for each suspect parameter, but one for all at a bound and one for all far off."""
+def remarks(known: Mapping[str, Mapping[str, Any]], said: bool = False) -> list[str]:
+    """Return a sentence for each suspect parameter, but one for all at a bound and one for all far off.
+
+    said: the headline names effects that do the same as parameters.
+    """
     bound = {name: p for name, p in known.items() if p.get("at_bound")}
     far = {name: p for name, p in known.items() if p.get("data_sheet")}
     texts = [f"{name} {p['structural']}." for name, p in known.items() if p["structural"] and name not in bound]
@@ -70,8 +73,13 @@ def remarks(known: Mapping[str, Mapping[str, Any]]) -> list[str]:
         texts += [f"{name} {p['data_sheet']}." for name, p in far.items()]
     elif far:
         texts.append(FAR.format(named=listed([f"{n} {p['mean']:.4g} ({p['away']:.1f} sd)" for n, p in far.items()])))
-    same = [f"{name} {p['mean']:.4g}" for name, p in known.items() if p.get("same_as")]
-    return texts + ([STANDS_FOR.format(parameters=listed(same), effects=stand_ins(known))] if same else [])
+    same = standing(known)
+    return texts + ([STANDS_FOR.format(parameters=same, effects=stand_ins(known))] if same and not said else [])
+
+
+def standing(known: Mapping[str, Mapping[str, Any]]) -> str:
+    """Name the parameters that effects may stand for, with their values; "" without any."""
+    return listed([f"{name} ({p['mean']:.4g})" for name, p in known.items() if p.get("same_as")], most=MOST)
 
 
 def stand_ins(known: Mapping[str, Mapping[str, Any]]) -> str:

@@ -22,8 +22,9 @@ HEADS = {
     "unexplained": "No effect of the library explains the gap: recalibration leaves {calibrated}.",
 }
 EITHER = (
-    "Either the data sheet is wrong, or the cause is {effects}. These logs do not separate them. Recalibration reduces "
-    "the gap from {nominal} to {calibrated}."
+    "Either the data sheet is wrong, or the cause is {effects}. The probability of a wrong data sheet is {own}. "
+    "To separate them, measure {parameters} and state the accuracy (--accuracy). Recalibration reduces the gap "
+    "from {nominal} to {calibrated}."
 )
 SMALL = " This exceeds the noise, but is too small to identify a cause."  # where the residual is above the noise
 PARTLY_HEAD = "Partly explained: {named}."
@@ -103,7 +104,7 @@ def sentences(d: Diagnosis) -> list[str]:
     if basis.get("efforts"):
         texts.append(f"By the logged efforts alone, {basis['efforts']}.")
     texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
-    texts += parameters.remarks(d.parameters)
+    texts += parameters.remarks(d.parameters, said=d.verdict == "parameters")
     texts += [named.not_on_offer(basis["tried"])] if d.verdict == "unexplained" and basis.get("tried") else []
     return [text for text in [*texts, notes.not_tried(basis.get("not_tried"))] if text]
 
@@ -118,7 +119,12 @@ def _head(d: Diagnosis) -> str:
         known = d.parameters if d.verdict == "parameters" else {}
         instead = parameters.stand_ins(known)
         far_off = [] if instead else parameters.far_from_model(known)
-        first = named.capital(((EITHER if instead else head) + SMALL * above).format(effects=instead, **fill))
+        if instead:
+            chance = d.basis.get("probability")
+            own = percent(chance["answer"]) if chance else "unknown"  # to files of before
+            either = {"parameters": parameters.standing(known), "own": own}
+            head, fill = EITHER, fill | either | {"effects": instead}
+        first = named.capital((head + SMALL * above).format(**fill))
         return " ".join([first + _acts(d), *far_off])
     if d.verdict == "unexplained":
         gap = of_rms(far.calibrated, far.with_effects)
@@ -209,7 +215,7 @@ def _noise(d: Diagnosis) -> list[str]:
 def _probable(d: Diagnosis) -> str:
     """Return the probability of the named effects, where they are the explanation."""
     chance = d.basis.get("probability")
-    if not chance or (d.verdict == "unexplained" and not d.gap.beyond):
+    if not chance or not d.effects or (d.verdict == "unexplained" and not d.gap.beyond):
         return ""
     own, others, nothing = (percent(chance[k]) for k in ("answer", "rivals", "nothing"))
     nothing = nothing if nothing.strip("0. %") else "less than one in a million"  # by the digits of `percent`

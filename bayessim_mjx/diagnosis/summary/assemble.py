@@ -19,7 +19,7 @@ from bayessim_mjx.diagnosis.request import length_unit
 from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes
 from bayessim_mjx.diagnosis.result import Diagnosis, Gap, Place
 from bayessim_mjx.diagnosis.selection import bounds
-from bayessim_mjx.diagnosis.selection.models import BASE, systematic
+from bayessim_mjx.diagnosis.selection.models import systematic
 from bayessim_mjx.diagnosis.selection.numbers import HIDDEN, SINGLES
 from bayessim_mjx.diagnosis.selection.search_state import SearchState, ranked
 from bayessim_mjx.diagnosis.summary import estimates, how_far
@@ -87,8 +87,7 @@ def basis(found: Findings, verdict: Verdict) -> dict[str, Any]:
     """Return the numbers behind the sentences that stand nowhere else in the result, see `Diagnosis.basis`."""
     state, cut, weighed = found.selection.state, found.setup.fitter.simulator.windows, found.selection.weighed
     window = cut.steps * cut.dt
-    top, rivals = found.flexible_winner, sum(weighed.weight[k] for k in weighed.beside)
-    chance = {"answer": weighed.weight[weighed.answer], "rivals": rivals, "nothing": weighed.weight[BASE]}
+    top = found.flexible_winner
     on = "effects" if found.model.effects else "recalibrated"
     return {
         "window": window,
@@ -97,7 +96,7 @@ def basis(found: Findings, verdict: Verdict) -> dict[str, Any]:
         "far_off": verdict.bent,
         "builds_up": verdict.builds_up,
         "above_noise": state.above_noise(state.base),
-        "probability": chance if weighed.answer else {},
+        "probability": weighed.chance(),
         "flexible": residual.flexible_of(top, on) if top is not None else {},
         "efforts": notes.first_verdict(found.setup.look),
         "tried": sorted({e.name for e in found.setup.physics.effects}),

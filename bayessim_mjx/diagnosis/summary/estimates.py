@@ -286,7 +286,7 @@ def per_condition(fitter: Fitter, model: Model) -> tuple[Array, Array]:
     q, _ = model.fit.quadratic()
     _, _, low, high = model.fit.prior()
     precision = model.fit.belief()
-    pull = precision * (np.array([c.neutral for c in model.fit.coordinates]) - model.fit.values)
+    pull = -precision * model.fit.away
     group = fitter.simulator.windows.group
     each, deviation = [], []
     inflation = max(model.total / model.fit.r.size, 0.5) * model.fit.r.size / model.samples

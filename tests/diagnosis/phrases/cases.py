@@ -104,7 +104,7 @@ def every():
         "parameters": made("parameters", far=gap(NO_EFFECTS, calibrated=1.1, with_effects=1.1), above_noise=False),
         "parameters, or an effect": made(
             "parameters", far=gap(NO_EFFECTS, calibrated=1.1, with_effects=1.1), above_noise=False,
-            parameters={"mass": light, "damping": light},
+            parameters={"mass": light, "damping": light}, probability={"answer": 0.3, "rivals": 0.7, "nothing": 0.3},
         ),
         "parameters and a little": made("parameters", far=gap(NO_EFFECTS, calibrated=1.3, with_effects=1.3)),
         "noise, white": made("noise", noise_memory=0.0),

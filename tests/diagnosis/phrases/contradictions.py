@@ -115,6 +115,7 @@ def _quoted(said: Said) -> Iterator[tuple[str, str]]:
         r"that force makes": [basis.get("remains")],
         "among all fitted explanations:": [chance.get("answer")],
         "for this one,": [chance.get("rivals")],
+        "of a wrong data sheet is": [chance.get("nothing")],
         r"force removes": held,
         r"The effects close": [max(sheet["coasting"], 0.0)],
     }
