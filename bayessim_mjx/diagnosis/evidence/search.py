@@ -100,14 +100,15 @@ class Search:
                 continue
             for c in self.state.candidates:
                 columns, key = self.state.secants.of([c]), rest | {c.label}
-                alike = related(c, effect) or same_lateness(c, effect, self.state.fitter.simulator.physics.mj_model)
-                if columns and alike and (self._first(best, key) if inertia(c, effect) else self._new(key)):
+                again = inertia(c, effect) or same_lateness(c, effect, self.state.fitter.simulator.physics.mj_model)
+                alike = again or related(c, effect)
+                if columns and alike and (self._first(best, key) if again else self._new(key)):
                     starts, known = self._begun(model, effect, c)
                     out.append(Plan(key, np.inf, rest, (columns[-1],), (1.0,), starts, best, known))
         return out
 
     def _first(self, best: Key, key: Key) -> bool:
-        """Whether a set was not yet fitted from the inertia of the leading one: from elsewhere it may rest far off."""
+        """Whether a set was not yet fitted from the leading one's inertia or delay: elsewhere it may rest far off."""
         new = (best, key) not in self._again
         self._again |= {(best, key)}
         return new

@@ -90,7 +90,7 @@ class Simulator:
         self.nv = int(physics.mj_model.nv)
         self.rollouts = 0
         self._run = programs.Kept(self._many, programs.traced_from(physics, "windows"))
-        self._moving = physics.having("on_motors")
+        self._moving, self._late = physics.having("on_motors"), physics.having("echoes")
         self.starts = (4 if self._moving else 2) * self.nv
         self._no_offset = np.zeros((self.lanes, self.starts), np.float32)
         self._no_force = jnp.asarray(np.zeros((self.lanes, windows.steps, self.nv), np.float32))
@@ -122,28 +122,40 @@ class Simulator:
             anew: `[]`, whether windows begin with the recorded motion; False: with the worlds `before` `[n, D]`.
         """
         begun = functools.partial(self._begun, batch, active, anew)
-        own, past, first = jax.vmap(begun, out_axes=(0, 0, None))(index, thetas, offsets, before)
+        own, past, back, first = jax.vmap(begun, out_axes=(0, 0, 0, None))(index, thetas, offsets, before)
         model, lead, (n, count, *_) = self.physics.mj_model, past.steps, own.command.shape
-        command = jnp.concatenate([own.around.command[:, :lead], own.command], axis=1)
+        start, longest = own.around.start, jnp.max(back) if self._late else 0
+        command = jnp.concatenate([own.around.command[:, :start], own.command], axis=1)
 
         def step(k: jax.Array, carry: tuple) -> tuple:
             now, shown = carry
-            row = jnp.maximum(k - lead, 0)
+            at = k - lead - longest  # the control step of the window, negative before it
+            row = jnp.maximum(at, 0)
 
-            def one(past: Past, own: Batch, command: jax.Array, force: jax.Array, now: World) -> tuple:
-                extra = jnp.where(k < lead, 0.0, force[row])
-                drive = Drive(extra, None if own.enabled is None else own.enabled[row], own.law, active)
-                now, data = control_step(self.physics, past.led(k, now), command[k], drive)
-                velocity = now.measurement["qvel"] + early(model) * data.qacc
-                return now, (now.measurement["qpos"], velocity)
+            def one(
+                past: Past, own: Batch, back: jax.Array, command: jax.Array, force: jax.Array, now: World
+            ) -> tuple[World, tuple[jax.Array, jax.Array]]:
+                here = jnp.maximum(start + jnp.where(k < lead, k - lead - back, at), 0)
+                drive = Drive(
+                    jnp.where(at < 0, 0.0, force[row]),
+                    None if own.enabled is None else own.enabled[row],
+                    own.law,
+                    active,
+                )
+                now = past.led(k, now)
+                new, data = control_step(self.physics, now, command[here], drive)
+                velocity = new.measurement["qvel"] + early(model) * data.qacc
+                if self._late:
+                    waits = (k >= lead) & (at < -back)
+                    new = jax.tree.map(functools.partial(jnp.where, waits), now, new)
+                return new, (new.measurement["qpos"], velocity)
 
-            now, new = jax.vmap(one)(past, own, command, forces, now)
+            now, new = jax.vmap(one)(past, own, back, command, forces, now)
             return now, tuple(x.at[:, row].set(y) for x, y in zip(shown, new, strict=True))
 
         nothing = tuple(jnp.zeros((n, count, size)) for size in (model.nq, model.nv))
-        ends, (qpos, qvel) = jax.lax.fori_loop(first, lead + count, step, (past.world, nothing))
-        errors = functools.partial(self._errors, anew)
-        return jax.vmap(errors)(own, qpos, qvel, past.start.theta), jax.vmap(_packed)(ends)
+        ends, (qpos, qvel) = jax.lax.fori_loop(first, lead + longest + count, step, (past.world, nothing))
+        return jax.vmap(self._errors)(own, qpos, qvel), jax.vmap(_packed)(ends)
 
     def _begun(
         self,
@@ -154,47 +166,57 @@ class Simulator:
         theta: jax.Array,
         offset: jax.Array,
         before: jax.Array,
-    ) -> tuple[Batch, Past, int | jax.Array]:
-        """(one window, what leads up to its start, the control step to begin with)."""
+    ) -> tuple[Batch, Past, jax.Array, int | jax.Array]:
+        """(one window, what leads up to its start, how much earlier it begins, the control step to begin with)."""
         own = jax.tree.map(lambda x: x[index], batch)
-        world = begin(self.physics, theta, self._moved(own.around, offset), active)
-        past = past_of(self.physics, world, own.around, active)
+        late = self._lateness(theta)
+        around, back = self._earlier(own.around, late, anew)
+        world = begin(self.physics, theta, self._moved(around, offset, late), active)
+        past = past_of(self.physics, world, around, active)
         start = jax.tree.map(functools.partial(jnp.where, anew), past.start, _unpacked(before, past.start))
         past = past.replace(start=start, world=past.world if past.steps else start, wanted=past.wanted & anew)
         if self._moving:
             past = past.replace(ahead=offset[2 * self.nv :])
-        return own, past, past.first
+        return own, past, back, past.first
 
-    def _moved(self, motion: Motion, offset: jax.Array) -> Motion:
+    def _lateness(self, theta: jax.Array) -> jax.Array:
+        """`[nv]`, control steps by which sensors show a window's start late."""
+        each, sites, none = self.physics.split(theta)[1], self.physics.sites, jnp.zeros(self.nv)
+        return sum((self.physics.effects[i].echoes(sites[i], each[i]) for i in self._late), none)
+
+    def _earlier(self, motion: Motion, late: jax.Array, anew: jax.Array) -> tuple[Motion, jax.Array]:
+        """Return (recorded motion that starts as many control steps earlier as sensors are late, how many).
+
+        What they show at the window's start is older than it. Simulated from there, each row of a window is predicted,
+        and by all models from a state that was measured as long before: a late sensor is as likely as a late command.
+        """
+        if not self._late or not motion.start:
+            return motion, jnp.int32(0)
+        steps = jnp.clip(jnp.ceil(jnp.max(late) - 1e-3), 0, motion.start).astype(jnp.int32)
+        back = jnp.where(anew, steps, 0)
+        rows = jnp.maximum(jnp.arange(len(motion.qpos)) - back, 0)
+        moved = {name: getattr(motion, name)[rows] for name in ("qpos", "qvel", "command")}
+        time = None if motion.time is None else jnp.maximum(motion.time - back * jnp.float32(self.physics.dt), 0.0)
+        return motion.replace(**moved, time=time), back
+
+    def _moved(self, motion: Motion, offset: jax.Array, late: jax.Array) -> Motion:
         """Return the recorded motion with another state at its start, and moved as that is around it.
 
         What sensors remember begins there too: with the recorded start, rows that late sensors show of it would keep
-        its noise, which no change of the start state takes away.
+        its noise, which no change of the start state takes away. A late sensor shows the start some steps after it.
         """
         speed = offset[self.nv : 2 * self.nv]
-        ahead = (jnp.arange(len(motion.qpos)) - motion.start) * jnp.float32(self.physics.dt)
-        away = offset[: self.nv] + ahead[:, None] * speed
-        qpos = jax.vmap(functools.partial(integrate, self.physics.mj_model))(motion.qpos, away)
+        ahead = (jnp.arange(len(motion.qpos))[:, None] - motion.start - late) * jnp.float32(self.physics.dt)
+        qpos = jax.vmap(functools.partial(integrate, self.physics.mj_model))(
+            motion.qpos, offset[: self.nv] + ahead * speed
+        )
         return motion.replace(qpos=qpos, qvel=motion.qvel + speed)
 
-    def _errors(self, anew: jax.Array, own: Batch, qpos: jax.Array, qvel: jax.Array, theta: jax.Array) -> jax.Array:
+    def _errors(self, own: Batch, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
         """`[H, 2 nv]`, of one window; not finite ones are FAR."""
         error = jax.vmap(functools.partial(difference, self.physics.mj_model))(own.qpos, qpos)
         error = jnp.concatenate([error, own.qvel - qvel], axis=1)
-        errors = jnp.where(anew, self._predicted(error, theta), error)
-        return jnp.nan_to_num(errors, nan=FAR, posinf=FAR, neginf=-FAR)
-
-    def _predicted(self, errors: jax.Array, theta: jax.Array) -> jax.Array:
-        """Errors `[H, 2 nv]` in which what only echoes the recording counts as the first row that is predicted does."""
-        echoing = self.physics.having("echoes")
-        if not echoing:
-            return errors
-        each, sites = self.physics.split(theta)[1], self.physics.sites
-        steps = sum(self.physics.effects[i].echoes(sites[i], each[i]) for i in echoing)
-        count = len(errors)
-        first = jnp.clip(jnp.ceil(jnp.asarray(steps) - 1e-3).astype(jnp.int32) - 1, 0, count - 1)
-        row = jnp.maximum(jnp.arange(count)[:, None], jnp.tile(first, 2))
-        return jnp.take_along_axis(errors, row, axis=0)
+        return jnp.nan_to_num(error, nan=FAR, posinf=FAR, neginf=-FAR)
 
     def loose(self, theta: Array) -> NDArray[np.bool_]:
         """`[s]`, which numbers of a start state act: motors stand beside their links where an effect lets them."""

@@ -19,6 +19,8 @@ FLOATING = """<mujoco><worldbody><body><freejoint/><geom size=".1"/>
   <body><joint type="ball"/><geom size=".1"/><body><joint name="h"/><geom size=".1"/></body></body></body></worldbody>
 </mujoco>"""
 
+SIGNALS = ("sensor", "actuator")
+
 
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory):
@@ -92,20 +94,23 @@ def test_a_right_simulator_follows_mujoco_at_a_tenth_of_the_step(setup):
     assert np.sqrt(np.mean(errors[..., 0] ** 2)) < 0.1 * late * np.sqrt(np.mean(speed**2))
 
 
-def test_what_a_late_sensor_repeats_of_the_recording_is_no_prediction(tmp_path):
-    """Of 2.5 control steps the first two are older than the start: they came from the log and agreed with it."""
-    logs = recorded(count=2, seconds=2.0, sigma=5e-3)
-    ready = prepare(nominal(tmp_path), logs, Request(["sensor_delay"]))
-    simulator = ready.fitter.simulator
-    names = list(simulator.physics.space.names)
-    (late,) = [i for i, name in enumerate(names) if name.endswith("sensor_delay.delay")]
-    theta = np.asarray(simulator.physics.space.nominal, np.float64)
-    thetas = np.stack([theta, theta])
-    thetas[1, late] = 2.5 * simulator.windows.dt
-    at_once, later = simulator.run(thetas)
-    assert np.abs(at_once[:, 0] - at_once[:, 2]).min() > 0
-    np.testing.assert_array_equal(later[:, :2], np.repeat(later[:, 2:3], 2, axis=1))
-    assert np.sqrt(np.mean(later[:, 0, 0] ** 2)) > 2e-3  # half the encoder's noise and more, in place of none
+def test_a_late_sensor_and_a_late_command_are_one(tmp_path):
+    """Where all commands or all measurements are late by as much, positions are the same whatever the noise is.
+
+    No row is read from the recording: what a sensor shows at a start is simulated from before it.
+    """
+    for sigma, delays, most in ((5e-3, (1.0, 3.0), 1e-6), (0.0, (2.5,), 3e-3)):  # between rows a start is interpolated
+        logs = recorded(count=2, seconds=2.0, sigma=sigma)
+        ready = prepare(nominal(tmp_path), logs, Request(["sensor_delay", "actuator_delay"]))
+        own, space = ready.fitter.simulator, ready.physics.space
+        sensor, command = (next(i for i, p in enumerate(space.names) if f".{at}_delay." in p) for at in SIGNALS)
+        offset = 0.01 * np.random.default_rng(0).normal(size=(2, len(own.windows), 2))
+        offset[1] = offset[0]
+        for rows in delays:
+            thetas = np.stack([space.nominal, space.nominal]).astype(float)
+            thetas[0, sensor] = thetas[1, command] = rows * own.windows.dt
+            late = own.run(thetas, offset)[:, 1:4, :, 0]  # before a log began no command is known
+            assert np.abs(late[0] - late[1]).max() < most < 0.01 < np.abs(late).max()
 
 
 def test_a_force_is_the_torque_of_a_motor(simulator):
