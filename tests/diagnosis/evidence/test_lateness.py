@@ -1,4 +1,4 @@
-"""Where all commands or all measurements are late, positions are the same: no log of both tells which of the two it is."""
+"""Where all commands or all measurements are late, positions are the same: no log of both separates the two."""
 
 import numpy as np
 import pytest
