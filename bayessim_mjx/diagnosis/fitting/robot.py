@@ -98,6 +98,7 @@ class Robot:
         model = self.mj_model if self.lean is None else with_options(self.lean, self.mj_model)
         model = with_timestep(model, control_dt)
         model.jnt_limited[list(self.unlimited)] = 0
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # a diagnosis compares states
         if self.rounds is not None:
             model.opt.iterations = min(self.rounds, model.opt.iterations)
             model.opt.ls_iterations = min(self.rounds, model.opt.ls_iterations)

@@ -164,3 +164,12 @@ def test_a_bad_params_yaml_names_the_file(tmp_path, text, words):
     (tmp_path / "p.yaml").write_text(text)
     with pytest.raises(UserError, match=words):
         robot.of_file(write(tmp_path / "arm.xml"), tmp_path / "p.yaml")
+
+
+def test_a_diagnosis_simulates_no_sensors_and_leaves_the_model_its_own():
+    xml = """<mujoco><worldbody><body><joint name="j"/><geom size=".1"/><site name="s"/></body></worldbody>
+      <actuator><motor joint="j"/></actuator><sensor><gyro site="s"/></sensor></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    off = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+    simulated = robot.robot_of(model).physics(0.01).mj_model
+    assert simulated.opt.disableflags & off and not model.opt.disableflags & off
