@@ -19,6 +19,7 @@ from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import REACH, Fit, broyden, settled
 from bayessim_mjx.diagnosis.fitting.quadratic import blocks, held_out, solve, weights
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
+from bayessim_mjx.diagnosis.statistics import times
 
 __all__ = ["Fit", "Fitter", "weights"]
 Array = NDArray[np.float64]
@@ -301,16 +302,16 @@ class Fitter:
 
     def _propose(self, fit: Fit) -> tuple[Fit, tuple[Array, Array]]:
         """Return (the fit with its next step's promise, the point to be tried next: values and offsets)."""
-        q, starts = fit.quadratic()
+        q, starts = quadratic.eliminate(fit.r, fit.A, fit.B, fit.offsets, fit.spread, 1 / fit.reach - 1)
         g, S = q.weighted(fit.weight)
         precision, pull, low, high = fit.prior()
         S = S + np.diag(precision)
         p = solve(S + fit.damping * np.diag(_scale(fit, S)), g + pull, low, high)
-        share = fit.reach * (2.0 - fit.reach)  # of what a whole step of the start states gains
-        by_starts = float(fit.weight @ (share * (_each(fit, fit.r, fit.offsets) - q.c)))
-        promise = by_starts + float(2 * (g + pull) @ p - p @ S @ p)
-        moved = fit.offsets + np.reshape(fit.reach, (-1, 1)) * starts.step(fit.A, p)
-        return replace(fit, promise=promise), (fit.values + p, moved)
+        dx = starts.step(fit.A, p)
+        there = fit.r - fit.A @ p - times(fit.B, dx)
+        gain = _each(fit, fit.r, fit.offsets) - _each(fit, there, fit.offsets + dx)
+        promise = float(fit.weight @ gain) + float(2 * pull @ p - precision @ p**2)
+        return replace(fit, promise=promise), (fit.values + p, fit.offsets + dx)
 
     def scores(self, fit: Fit, group: NDArray[np.int64] | None = None) -> tuple[Array, Array]:
         """Held-out costs `[W]` (unweighted) and estimates without each condition, relative to the fit `[G, k]`."""

@@ -87,12 +87,19 @@ def _dot(a: Array, b: Array) -> Array:
     return np.asarray(np.sum(a * b, -1))
 
 
-def eliminate(r: Array, A: Array, B: Array, x: Array, spread: Array) -> tuple[Quadratic, Starts]:
-    """(quadratic in the parameters, starts) for r `[W, n]`, A `[W, n, K]`, B `[W, n, s]`, x `[W, s]`, spread `[s]`."""
+def eliminate(
+    r: Array, A: Array, B: Array, x: Array, spread: Array, damping: Array | float = 0.0
+) -> tuple[Quadratic, Starts]:
+    """(quadratic in the parameters, starts) for r `[W, n]`, A `[W, n, K]`, B `[W, n, s]`, x `[W, s]`, spread `[s]`.
+
+    damping: Levenberg's, of each window's start state `[W]`, as a share of its own curvature.
+    """
     spread = np.broadcast_to(spread, x.shape[1:])
     own = np.flatnonzero(B.any((0, 1)))  # the others move nothing, and go back to what was measured
     B_own, x_own, D = B if len(own) == len(spread) else B[:, :, own], x[:, own], spread[own]
-    inner = np.asarray(np.linalg.inv(B_own.mT @ B_own + np.diag(1 / D**2)), np.float64)
+    bend = B_own.mT @ B_own + np.diag(1 / D**2)
+    bend = bend + np.reshape(damping, (-1, 1, 1)) * bend * np.eye(len(own))
+    inner = np.asarray(np.linalg.inv(bend), np.float64)
     pull = times(B_own.mT, r) - x_own / D**2
     BA = B_own.mT @ A  # products of matrices throughout: einsum takes several times as long
     MBA = inner @ BA
