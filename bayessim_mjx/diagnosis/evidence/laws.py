@@ -6,7 +6,7 @@ from elsewhere comes to rest far from them: a payload's place hardly moves anyth
 **Hidden** (`by_effects`). A bias beside a spring moves the spring's angle of rest; viscous friction beside friction by
 direction is part of it. Such logs do not tell whether both are there: the named law stands for both.
 
-**Stand-ins** (`stand_ins`). A joint's viscous friction is its damping, rotor inertia beside a slide is its mass, a
+**Stand-ins** (`stand_ins`, `by_parameters`). A joint's viscous friction is its damping, rotor inertia beside a slide is its mass, a
 drive's gain is all of the robot's inertia, damping and friction together. The prior decides whether the data sheet is
 wrong or an effect is missing.
 """
@@ -241,6 +241,22 @@ class StandIn:
     column: Column
     point: Array
     steps: Array
+
+
+def by_parameters(answer: Model, larger: Sequence[Model]) -> dict[str, tuple[str, ...]]:
+    """List {known parameter: labels of effects with which it is nearer to the data sheet by half of its way and more}.
+
+    Args:
+        larger: the answer with further effects, that the evidence does not speak strongly against.
+    """
+    out: dict[str, tuple[str, ...]] = {}
+    for model in larger:
+        more = [e.label for e in model.effects if e not in answer.effects]
+        away = dict(zip(model.fit.names, model.fit.away, strict=True))
+        for c, alone in zip(answer.fit.coordinates, answer.fit.away, strict=True):
+            if (c.stated or c.kind) and abs(away[c.name]) < 0.5 * abs(alone):
+                out[c.name] = tuple(dict.fromkeys([*out.get(c.name, ()), *more]))
+    return out
 
 
 def stand_ins(state: SearchState, answer: Model) -> list[StandIn]:

@@ -96,7 +96,7 @@ class Selection:
         chosen: {operating condition: effects that are named without it}.
         elsewhere: share of the gap closed on conditions that the choice was made without; NaN of one condition.
         hidden: labels of effects that would not show beside those of the answer (`laws.by_effects`).
-        stand_ins: {known parameter: labels of effects that it may stand for} (`_stand_ins`).
+        stand_ins: {known parameter: labels of effects that it may stand for} (`laws.by_parameters`).
         weighed: probabilities of the sets that were fitted; estimated: posterior of the answer's numbers.
         force: what the answer leaves as force.
     """
@@ -151,7 +151,7 @@ def select(
         promised=promised(state, answer.effects) if answer.effects else (0.0, {}),
         chosen=chosen,
         hidden=laws.by_effects(state, answer, say),
-        stand_ins=_stand_ins(answer, [state.models[k] for k in found.beside if found.answer < k]),
+        stand_ins=laws.by_parameters(answer, [state.models[k] for k in found.beside if found.answer < k]),
         weighed=found,
         estimated=estimated(search.weighing, found),
         force=force_left.of_set(search.weighing, found.answer),
@@ -175,22 +175,6 @@ def _rival(weighing: Weighing, effect: Candidate, key: Key, found: Weighed) -> R
     nats = found.nats[found.answer] - found.nats[key]
     why = phrases.CONTAINS if contains else phrases.close_by(nats, state.gap(answer).closed - closed)
     return Rival(others, model, closed, why, contains or same, size)
-
-
-def _stand_ins(answer: Model, larger: Sequence[Model]) -> dict[str, tuple[str, ...]]:
-    """{known parameter: labels of effects with which it is nearer to the data sheet by more than half of its way}.
-
-    Args:
-        larger: the answer with further effects, that the evidence does not speak strongly against.
-    """
-    out: dict[str, tuple[str, ...]] = {}
-    for model in larger:
-        more = [e.label for e in model.effects if e not in answer.effects]
-        away = dict(zip(model.fit.names, model.fit.away, strict=True))
-        for c, alone in zip(answer.fit.coordinates, answer.fit.away, strict=True):
-            if (c.stated or c.kind) and abs(away[c.name]) < 0.5 * abs(alone):
-                out[c.name] = tuple(dict.fromkeys([*out.get(c.name, ()), *more]))
-    return out
 
 
 def _subsets(state: SearchState, answer: Model, say: Progress) -> dict[Key, Model]:

@@ -19,7 +19,6 @@ from bayessim_mjx.diagnosis.fitting.candidates import Coordinate
 from bayessim_mjx.diagnosis.fitting.fit import REACH, Fit, broyden, settled
 from bayessim_mjx.diagnosis.fitting.quadratic import blocks, held_out, solve, weights
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator
-from bayessim_mjx.diagnosis.statistics import times
 
 __all__ = ["Fit", "Fitter", "weights"]
 Array = NDArray[np.float64]
@@ -308,7 +307,7 @@ class Fitter:
         S = S + np.diag(precision)
         p = solve(S + fit.damping * np.diag(_scale(fit, S)), g + pull, low, high)
         dx = starts.step(fit.A, p)
-        there = fit.r - fit.A @ p - times(fit.B, dx)
+        there = fit.r - fit.A @ p - np.einsum("wns,ws->wn", fit.B, dx)
         gain = _each(fit, fit.r, fit.offsets) - _each(fit, there, fit.offsets + dx)
         promise = float(fit.weight @ gain) + float(2 * pull @ p - precision @ p**2)
         return replace(fit, promise=promise), (fit.values + p, fit.offsets + dx)
