@@ -62,6 +62,7 @@ class Training:
         self.domain = domain_of(env, config.domain or prior)
         self.key, self.evaluation_key = jax.random.split(jax.random.PRNGKey(config.seed))
         self.compiling, self.filmed = CompileClock(), 0
+        self.not_finite: dict[str, int] = {}  # what the user has been warned of
         self.film = film(self.env, config)  # None: no videos
 
     def state(self, resume: bool) -> tuple[Any, int | None]:
@@ -170,9 +171,8 @@ class Training:
         while (done := int(state.iteration)) < ppo.max_iterations:
             self.stop.check()
             chunk = min(ppo.save_interval - done % ppo.save_interval, ppo.max_iterations - done)
-            state, _ = rl.run(
-                self.env, ppo, state, self.domain, iterations=chunk, progress=self.progress, teacher=self.teacher
-            )
+            more = {"progress": self.progress, "teacher": self.teacher, "seen": self.not_finite}
+            state, _ = rl.run(self.env, ppo, state, self.domain, iterations=chunk, **more)
             self.save(state, self.evaluate(state))
         return state
 
