@@ -104,12 +104,8 @@ class Robot:
         """Return the forces of the actuators, N or N m."""
         return self.data.actuator_force[self.drives]
 
-    def clock(self) -> float:
-        """Return the robot's own time since the start, s. (A robot's computer: `time.monotonic()`.)"""
-        return float(self.data.time)
-
-    def wait(self, until: float) -> None:
-        """Time goes by, until the clock has `until` s. (A robot does this by itself.)"""
+    def move(self, until: float) -> None:
+        """Move on to `until` s after the start. (A robot does this by itself.)"""
         while self.data.time < until - 0.5 * self.model.opt.timestep:
             self.mujoco.mj_step(self.model, self.data)
 
@@ -160,7 +156,9 @@ def loop(policy: Any, robot: Robot, safety: Safety, seconds: float, fast: bool =
     low, high = robot.command_ranges()
     begun = time.perf_counter()
     for k in range(round(seconds / policy.dt)):
-        read, now = time.perf_counter(), robot.clock()
+        now = k * policy.dt if fast else time.perf_counter() - begun  # of the clock, so that the log shows late steps
+        robot.move(now)
+        read = time.perf_counter()
         q, w = robot.read()
         seen, action, command = policy(q, w)
         command = np.clip(command, low, high)
@@ -171,7 +169,6 @@ def loop(policy: Any, robot: Robot, safety: Safety, seconds: float, fast: bool =
         robot.write(command)
         latency.append(time.perf_counter() - read)
         rows.append([now, *seen, *action, *command, *GOALS.values(), *q.values(), *w.values(), *robot.efforts()])
-        robot.wait((k + 1) * policy.dt)
         due = read + policy.dt if fast else begun + (k + 1) * policy.dt
         late = time.perf_counter() - due
         reason = reason or safety.clock(late, policy.dt) or ""
@@ -180,7 +177,6 @@ def loop(policy: Any, robot: Robot, safety: Safety, seconds: float, fast: bool =
             break
         if not fast:
             time.sleep(max(0.0, -late))
-            robot.wait(time.perf_counter() - begun)  # what is late is late for the robot, too
     return rows, np.array(latency), reason
 
 

@@ -106,7 +106,7 @@ def test_a_late_step_is_late_in_the_log_and_for_the_robot(deploy):
     rows, _, reason = deploy.loop(Slow(), robot, deploy.Safety({}, 9.0, 9.0, 99), 0.2)
     clock, place = np.array(rows)[:, [0, 4]].T
     assert not reason and len(rows) == 10
-    assert np.diff(clock)[2] > 0.058 and place == pytest.approx(clock, abs=1e-9)
+    assert np.diff(clock)[2] > 0.058 and place == pytest.approx(clock, abs=0.51e-3)  # half a timestep
 
 
 def test_it_stops_where_a_limit_is_passed(deploy, file, tmp_path, monkeypatch, capsys):
