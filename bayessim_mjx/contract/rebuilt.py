@@ -84,10 +84,12 @@ def _offset(evidence: Evidence, seen: Sequence[Array], limit: float) -> tuple[fl
             if kind in ("sin", "cos") or (kind == "qpos" and entry.unit == "rad"):
                 angles.setdefault(joint, []).append(entry.name)
     best: tuple[float, Finding] | None = None
+    steps = ("time", "observation", "action", "ctrl")
+    runs = [replace(run, **{name: getattr(run, name)[:ROWS] for name in steps}) for run in evidence.runs]
     for joint, names in angles.items():
 
         def left(offset: float, joint: str = joint) -> float:
-            given = [evidence.rebuild(_turned(run, joint, offset))[:ROWS] for run in evidence.runs]
+            given = [evidence.rebuild(_turned(run, joint, offset)) for run in runs]
             found = _left(evidence, given, seen, limit)
             return np.inf if found is None else found
 

@@ -331,8 +331,9 @@ def test_predictive_axes_name_quantity_joint_and_unit():
     real = {f"{stream}:{joint}": np.sin(time) for stream in ("qpos", "qvel") for joint in ("elbow", "rail")}
     units = {"qpos:elbow": "rad", "qvel:elbow": "rad/s", "qpos:rail": "m", "qvel:rail": "m/s"}
     figure = plots.predictive(
-        time, real, {k: v + np.array([[-0.3], [0.0], [0.3]]) for k, v in real.items()}, units=units
+        time, real, {k: v + np.array([[-0.3], [0.0], [0.3]]) for k, v in real.items()}, units=units, own="true motion"
     )
+    assert "true motion" in [text for text, _ in texts(figure)]
     labels = {axes.get_ylabel().replace("\n", " ") for axes in figure.axes}
     assert labels == {
         "angle of elbow [rad]", "angular velocity of elbow [rad/s]", "position of rail [m]", "velocity of rail [m/s]",
