@@ -26,13 +26,13 @@ def nearest(given: str, names: Iterable[str], n: int = 3, cutoff: float = 0.6) -
     return difflib.get_close_matches(given, list(names), n, cutoff)
 
 
-def unknown(what: str, given: str, allowed: Iterable[str], page: str = "") -> UserError:
-    """Make the error for an unknown name: close ones first; then all, or of many the page that lists them."""
+def unknown(what: str, given: str, allowed: Iterable[str], lister: str = "") -> UserError:
+    """Make the error for an unknown name: close ones first; then all, or of many the command that lists them."""
     names = list(allowed)
     last = {n.rpartition(".")[2].lower(): n for n in names}
     close = [last[n] for n in nearest(given.rpartition(".")[2].lower(), last)]
     hint = f" Did you mean {' or '.join(close)}?" if close else ""
-    allowed = f"those in {page}" if page and close and len(names) > MANY else ", ".join(names)
+    allowed = f"those that `{lister}` prints" if lister and close and len(names) > MANY else ", ".join(names)
     return UserError(f"{what} {given!r} is unknown.{hint} Allowed: {allowed}")
 
 

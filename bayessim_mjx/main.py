@@ -81,7 +81,7 @@ def _parser() -> cli.Parser:
 def _prepare(args: argparse.Namespace) -> tuple[Config, Any]:
     """Return (settings, run to go on with or None)."""
     if args.resume:
-        run = cli.open_run(args.resume, "--resume")
+        run = cli.run_to_resume(args.resume, "main")
         if args.max_iterations is not None:
             raise UserError(
                 "--max_iterations: all rounds of a run have the same number, also those that are done; to train longer "
@@ -110,12 +110,19 @@ def _run(config: Config, run: Any, device: Any, command: Sequence[str], console:
     from bayessim_mjx.monitor.opening import opening
 
     env = registry.make(config.task, config=config)
+    other = "" if run is not None else cli.of_another_task(config, env)
     console.start(opening(config, env, device))
+    if other:
+        console.warning(other)
     console.phase("compiling the training")
     compiling = CompileClock()
-    parts = loop.make(config, env)
-    config = parts.config  # with the surrogate's parameters: the run keeps them
-    state, resumed_at = _state(parts, run, console)
+    try:
+        parts = loop.make(config, env)
+        config = parts.config  # with the surrogate's parameters: the run keeps them
+        state, resumed_at = _state(parts, run, console)
+    except KeyboardInterrupt:
+        console.say("interrupted while compiling: nothing was written; give the same command again")
+        raise
     compiling.report(console, "the training")
     if run is None:
         run = runs.Run.create(config.logdir, config.task, config.name, config, command)
@@ -226,15 +233,23 @@ def _module(name: str) -> Any:
 
 
 def _help_parser() -> cli.PlainParser:
-    about = "Show the help of a command, or the list of all commands."
-    parser = cli.PlainParser("help", description=about, usage="%(prog)s [COMMAND]")
-    parser.add_argument("words", metavar="COMMAND", nargs="*", help="a command, and its part where it has parts")
+    about = "Show the help of a command, the list of all commands, or all settings with their defaults."
+    parser = cli.PlainParser("help", description=about, usage="%(prog)s [COMMAND | settings [SECTION]]")
+    what = "a command, and its part where it has parts; or settings, and a section, such as ppo"
+    parser.add_argument("words", metavar="COMMAND", nargs="*", help=what)
     return parser
 
 
 def _help(argv: Sequence[str] | None) -> int:
-    """Print the help of a command, or all commands in their groups; exit code 0, or 2 (no such command)."""
+    """Print the help of a command, all commands in their groups, or settings; exit code 0, or 2 (no such command)."""
     words = _help_parser().parse_args(argv).words
+    if words[:1] == ["settings"]:
+        if len(words) > 2:
+            raise UserError(f"help settings {' '.join(words[1:])}: give one section, such as ppo")
+        from bayessim_mjx.config import listing
+
+        print(listing.text(*words[1:]))
+        return 0
     if words:
         return _named([*words, "--help"])
     text = f"{ABOUT}\n\n{commands.overview()}"

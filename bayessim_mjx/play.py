@@ -140,7 +140,9 @@ def _export(env: Any, policy: Any, checkpoint: Path, run: Any, target: str) -> s
     folder = (run.path if run is not None else checkpoint.parent) / "exported"
     path = Path(target) if target else folder / f"{checkpoint.name}.onnx"
     error = export.write(path, policy, env, {"checkpoint": checkpoint.name})
-    checked = "not compared (onnxruntime is not installed)" if error is None else f"differs by {error:.1e} at most"
+    checked = "not compared (onnxruntime is not installed)"
+    if error is not None:
+        checked = f"its actions differ by {error:.1e} at most from the policy's"
     return f"exported {path}: {checked}"
 
 

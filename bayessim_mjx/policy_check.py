@@ -46,7 +46,7 @@ def _policy(argv: Sequence[str] | None) -> int:
     if args.out:
         Path(args.out).write_text(json.dumps(_facts(result), indent=1) + "\n", encoding="utf-8")
         print(f"written: {args.out}")
-    return 1 if result.findings or not words.shows(result) else 0
+    return 0 if words.outcome(result) == "right" else 1
 
 
 def _channels(args: Any) -> Any:
@@ -69,7 +69,7 @@ def _show(result: Any) -> None:
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
     if result.findings:
         table = Table(box=None, pad_edge=False, header_style="bold")
-        for title in ("where", "what differs", "unexplained: before, with it"):
+        for title in ("where", "what differs", "error of its inputs: now, if mended"):
             table.add_column(title, overflow="fold")
         for finding in result.findings:
             table.add_row(words.where(finding), words.sentence(finding), words.evidence(finding))
@@ -92,7 +92,7 @@ def _facts(result: Any) -> dict[str, Any]:
     from bayessim_mjx.contract import words
 
     return {
-        "verdict": "differs" if result.findings else "right" if words.shows(result) else "not compared",
+        "verdict": words.outcome(result),
         "findings": [asdict(f) | {"sentence": f"{words.where(f)}: {words.sentence(f)}"} for f in result.findings],
         "compared": result.compared,
         "cannot_be_told": {name: words.WHY[reason] for name, reason in result.untold.items()},

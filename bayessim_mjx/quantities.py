@@ -80,6 +80,11 @@ def percent(share: Any, sign: bool = False) -> str:
     return ("+" if sign and share > 0 else "") + f"{fixed(100 * share, min(places, 4))} %"
 
 
+def p_value(p: float) -> str:
+    """`p = 0.0012`; below a thousand-millionth only that it is."""
+    return f"p = {p:.2g}" if p >= 1e-9 else "p < 1e-9"
+
+
 def estimate(value: Any, uncertainty: Any = math.nan, digits: int = DIGITS) -> str:
     """`0.0312 ± 0.0021`: `digits` significant digits of the uncertainty, the value to the same decimal place.
 

@@ -62,6 +62,7 @@ class Training:
         self.domain = domain_of(env, config.domain or prior)
         self.key, self.evaluation_key = jax.random.split(jax.random.PRNGKey(config.seed))
         self.compiling, self.filmed = CompileClock(), 0
+        self.not_finite: dict[str, int] = {}  # what the user has been warned of
         self.film = film(self.env, config)  # None: no videos
 
     def state(self, resume: bool) -> tuple[Any, int | None]:
@@ -151,7 +152,9 @@ class Training:
         self.writer.scalars(int(state.iteration), figures)
         self.compiling.report(self.console, "the evaluation")
         found = estimate(score, result["return"].std())
-        self.console.say(f"evaluation at {int(state.iteration)}: return {found} over {count} episodes")
+        drawn = "physics drawn from --domain" if self.config.domain else "physics drawn from the prior"
+        physics = "nominal physics" if self.domain is None else drawn
+        self.console.say(f"evaluation at {int(state.iteration)}: return {found} over {count} episodes on {physics}")
         return score
 
     def owes_evaluation(self, iteration: int) -> bool:
@@ -170,9 +173,8 @@ class Training:
         while (done := int(state.iteration)) < ppo.max_iterations:
             self.stop.check()
             chunk = min(ppo.save_interval - done % ppo.save_interval, ppo.max_iterations - done)
-            state, _ = rl.run(
-                self.env, ppo, state, self.domain, iterations=chunk, progress=self.progress, teacher=self.teacher
-            )
+            more = {"progress": self.progress, "teacher": self.teacher, "seen": self.not_finite}
+            state, _ = rl.run(self.env, ppo, state, self.domain, iterations=chunk, **more)
             self.save(state, self.evaluate(state))
         return state
 
@@ -240,8 +242,11 @@ def _run(config: Config, run: Any, command: Sequence[str], headless: bool) -> in
             from bayessim_mjx.wrappers import agents
 
             agents.check(config, env)
-        console.start(opening(config, env, device, infers=False))
         resume = run is not None
+        other = "" if resume else cli.of_another_task(config, env)
+        console.start(opening(config, env, device, infers=False))
+        if other:
+            console.warning(other)
         if run is None:
             run = runs.Run.create(config.logdir, config.task, config.name, config, command)
         else:
@@ -276,7 +281,7 @@ def _train(argv: Sequence[str] | None) -> int:
         return cli.list_tasks()
     command = [cli.SCRIPT, "train", *argv]
     if args.resume:
-        run = cli.open_run(args.resume, "--resume")
+        run = cli.run_to_resume(args.resume, "train")
         return _run(cli.prolonged_config(args, run), run, command, args.headless)
     more = cli.physics_settings(args)
     if args.agent:

@@ -71,9 +71,10 @@ def _executed(path: Path, changed: int, package: str) -> ModuleType:
 
 
 def line_of(error: BaseException, path: Path) -> str:
-    """Where in the user's file it went wrong, as ", line 3"; empty where the file has no part in it."""
+    """Where in the user's file it went wrong, as ", line 3 in `reward`"; empty where the file has no part in it."""
     import traceback
 
-    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
-    line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
-    return f", line {line}" if line else ""
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
+    line = error.lineno if isinstance(error, SyntaxError) else frames[-1].lineno if frames else None
+    methods = [f.name for f in frames if not f.name.startswith("<")]  # outside of functions: <module>
+    return (f", line {line}" if line else "") + (f" in `{methods[0]}`" if methods else "")

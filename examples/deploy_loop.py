@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+# goals that the policy is given; the log has them as task:<name>
+GOALS: dict[str, float] = {}
 # observations by their names in the policy file, from positions q and speeds w by joint
 OBSERVED = {
     "cos_theta": lambda q, w: np.cos(q["hinge"]),
@@ -54,14 +56,14 @@ class Policy:
         given = {name: np.array(x, np.float32) for name, x in golden.items() if x is not None}
         return float(np.abs(self.session.run(["action"], given)[0] - np.array(self.facts["golden_action"])).max())
 
-    def __call__(self, q: dict[str, float], w: dict[str, float]) -> np.ndarray:
-        """Commands in the order of `actuators`."""
+    def __call__(self, q: dict[str, float], w: dict[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(observation, action, command): the last two in the order of `actuators`."""
         seen = np.array([[OBSERVED[name](q, w) for name in self.facts["observation_names"]]], np.float32)
         action, *memory = self.session.run(
             ["action", *(f"{n}_next" for n in self.memory)], {"observation": seen, **self.memory}
         )
         self.memory = dict(zip(self.memory, memory, strict=True))
-        return self.offset + self.scale * action[0]
+        return seen[0], action[0], self.offset + self.scale * action[0]
 
 
 def _value(text: str) -> Any:
@@ -102,9 +104,9 @@ class Robot:
         """Return the forces of the actuators, N or N m."""
         return self.data.actuator_force[self.drives]
 
-    def wait(self, seconds: float) -> None:
-        """Time goes by. (A robot does this by itself.)"""
-        for _ in range(max(1, round(seconds / self.model.opt.timestep))):
+    def move(self, until: float) -> None:
+        """Move on to `until` s after the start. (A robot does this by itself.)"""
+        while self.data.time < until - 0.5 * self.model.opt.timestep:
             self.mujoco.mj_step(self.model, self.data)
 
     def ranges(self) -> dict[str, tuple[float, float]]:
@@ -154,23 +156,27 @@ def loop(policy: Any, robot: Robot, safety: Safety, seconds: float, fast: bool =
     low, high = robot.command_ranges()
     begun = time.perf_counter()
     for k in range(round(seconds / policy.dt)):
+        now = k * policy.dt if fast else time.perf_counter() - begun  # of the clock, so that the log shows late steps
+        robot.move(now)
         read = time.perf_counter()
         q, w = robot.read()
-        command = np.clip(policy(q, w), low, high)
+        seen, action, command = policy(q, w)
+        command = np.clip(command, low, high)
         stop = safety.state(q, w, robot.efforts())
         if stop is not None or not np.all(np.isfinite(command)):
             reason, command = stop or "the policy's command is not finite", np.zeros_like(command)
+            seen, action = seen * np.nan, action * np.nan  # the command is not the policy's: nothing to compare
         robot.write(command)
         latency.append(time.perf_counter() - read)
-        rows.append([k * policy.dt, *command, *q.values(), *w.values(), *robot.efforts()])
-        robot.wait(policy.dt)
+        rows.append([now, *seen, *action, *command, *GOALS.values(), *q.values(), *w.values(), *robot.efforts()])
         due = read + policy.dt if fast else begun + (k + 1) * policy.dt
-        reason = reason or safety.clock(time.perf_counter() - due, policy.dt) or ""
+        late = time.perf_counter() - due
+        reason = reason or safety.clock(late, policy.dt) or ""
         if reason:
             robot.write(np.zeros_like(command))
             break
         if not fast:
-            time.sleep(max(0.0, due - time.perf_counter()))
+            time.sleep(max(0.0, -late))
     return rows, np.array(latency), reason
 
 
@@ -178,7 +184,9 @@ def write(folder: Path, rows: list, robot: Robot, policy: Policy, reason: str) -
     """One more log in the library's own format, and its metadata beside it."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"run_{len(list(folder.glob('run_*.csv')))}.csv"
-    columns = [f"ctrl:{a}" for a in policy.actuators] + [f"{c}:{j}" for c in ("qpos", "qvel") for j in robot.joints]
+    columns = [f"observation:{name}" for name in policy.facts["observation_names"]]
+    columns += [f"{c}:{a}" for c in ("action", "ctrl") for a in policy.actuators] + [f"task:{g}" for g in GOALS]
+    columns += [f"{c}:{j}" for c in ("qpos", "qvel") for j in robot.joints]
     header = ",".join(["time", *columns, *(f"effort:{a}" for a in policy.actuators)])
     np.savetxt(path, np.array(rows), "%.9g", ",", header=header, comments="")
     note = {"checkpoint": policy.facts.get("checkpoint", ""), "note": reason or "ran to its end"}

@@ -3,15 +3,24 @@
 from bayessim_mjx.cli.commands import COMMANDS, SCRIPT, prog_of
 from bayessim_mjx.cli.ends import DEBUG_VARIABLE, command
 from bayessim_mjx.cli.flags import Parser
-from bayessim_mjx.cli.folders import open_run, writable
+from bayessim_mjx.cli.folders import open_run, run_to_resume, writable
 from bayessim_mjx.cli.parsers import PlainParser, integer, of_urdf, one_robot, positive, task, urdf_words, whole
-from bayessim_mjx.cli.policies import find_checkpoint, load_policy, physics_settings, pin_policy, privileged, warm_start
+from bayessim_mjx.cli.policies import (
+    find_checkpoint,
+    load_policy,
+    of_another_task,
+    physics_settings,
+    pin_policy,
+    privileged,
+    warm_start,
+)
 from bayessim_mjx.cli.settings import config_of, list_tasks, prolonged_config, resumed_config, say_changes, task_name
 from bayessim_mjx.cli.status import Stop, first_writes, graceful, running
 
 __all__ = [
     "COMMANDS", "DEBUG_VARIABLE", "SCRIPT", "Parser", "PlainParser", "Stop", "command", "config_of", "find_checkpoint",
-    "first_writes", "graceful", "integer", "list_tasks", "load_policy", "of_urdf", "one_robot", "open_run",
-    "physics_settings", "pin_policy", "positive", "privileged", "prog_of", "prolonged_config", "resumed_config",
-    "running", "say_changes", "task", "task_name", "urdf_words", "warm_start", "whole", "writable",
+    "first_writes", "graceful", "integer", "list_tasks", "load_policy", "of_another_task", "of_urdf", "one_robot",
+    "open_run", "physics_settings", "pin_policy", "positive", "privileged", "prog_of", "prolonged_config",
+    "resumed_config", "run_to_resume", "running", "say_changes", "task", "task_name", "urdf_words", "warm_start",
+    "whole", "writable",
 ]  # fmt: skip

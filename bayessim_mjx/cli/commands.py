@@ -87,7 +87,7 @@ COMMANDS = {
         "measure whether JAX or MuJoCo Warp is faster here",
         ("--task Ant", "--task Ant --num_envs 1024 4096"),
     ),
-    "help": Command(SHELL, "show the help of a command", ("diagnose", "main"), "main"),
+    "help": Command(SHELL, "show the help of a command, or the settings", ("diagnose", "settings ppo"), "main"),
     "completion": Command(
         SHELL,
         "print a script that completes commands in bash, zsh or fish",

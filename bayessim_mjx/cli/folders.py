@@ -1,9 +1,12 @@
 """Folders that flags name: one that results go to, and one that holds a run."""
 
+import shlex
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bayessim_mjx import trust
+from bayessim_mjx.cli.commands import SCRIPT, prog_of
 from bayessim_mjx.errors import UserError
 
 if TYPE_CHECKING:
@@ -44,3 +47,19 @@ def open_run(folder: str | Path, flag: str) -> "Run":
         f"{flag} {folder}: not a run folder (no {MANIFEST} in it); give the folder that a run prints at its start, "
         "<logdir>/<Task>/<date>"
     )
+
+
+def run_to_resume(folder: str | Path, command: str) -> "Run":
+    """Return the run that `command` is to go on with.
+
+    Raises:
+        UserError: there is no run, or another command made it; with the command that goes on with it.
+    """
+    run = open_run(folder, "--resume")
+    script, made, *_ = [*shlex.split(str(run.manifest.get("command", ""))), "", ""]
+    if script != SCRIPT or made not in ("main", "train") or made == command:
+        return run
+    own = f"`{prog_of(made)} --resume {run.path}{trust.flags()}` goes on with it"
+    longer = f"`{prog_of('train')} --domain {run.path} --checkpoint {run.path}{trust.flags()}`"
+    more = f"; {longer} trains its policy further, under its posterior" if made == "main" else ""
+    raise UserError(f"--resume {folder}: this is a run of {made}, not of {command}; {own}{more}")

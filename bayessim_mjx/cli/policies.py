@@ -20,6 +20,8 @@ def find_checkpoint(which: str, task: str | None, logdir: str) -> tuple[Path, "R
         if not task:
             raise UserError(f"--checkpoint {which}: give --task NAME, or the path of a run")
         run = latest_run(logdir, task)
+        if which == "best" and run.manifest["best"] is None:
+            raise UserError(_without_best(run, logdir, task))
         return run.checkpoint(which), run
     path = Path(which)
     if (path / MANIFEST).is_file():
@@ -35,12 +37,44 @@ def find_checkpoint(which: str, task: str | None, logdir: str) -> tuple[Path, "R
     return path, Run.open(parents[1]) if (parents[1] / MANIFEST).is_file() else None
 
 
+def _without_best(run: "Run", logdir: str, task: str) -> str:
+    """Say that the newest run has no best, and what may be given in its place."""
+    from bayessim_mjx.runs import find_runs
+
+    best = [other.path for other in find_runs(logdir, task) if other.manifest["best"] is not None]
+    older = f", or --checkpoint {best[-1]}, the newest run that has a best" if best else ""
+    status = run.manifest["status"]
+    return f"--checkpoint best: {run.path}, the newest run ({status}), has none; give --checkpoint latest{older}"
+
+
 def pin_policy(config: Config) -> Config:
     """`bayessim.policyCheckpt` as the path of one checkpoint folder, which has to be there."""
     if config.bayessim.policyCheckpt is None:
         return config
     path, _ = find_checkpoint(config.bayessim.policyCheckpt, config.task, config.logdir)
     return replace(config, bayessim={"policyCheckpt": str(path.absolute())})
+
+
+def of_another_task(config: Config, env: Any) -> str:
+    """Say of which task the policy is that training begins with, where it is another one; "" for the same.
+
+    Raises:
+        UserError: its networks do not fit this task; naming both tasks.
+    """
+    if config.bayessim.policyCheckpt is None:
+        return ""
+    from bayessim_mjx.runs.checkpoints import MADE_WITH
+
+    path, run = find_checkpoint(config.bayessim.policyCheckpt, None, "")
+    if run is None or run.manifest["task"] == config.task:
+        return ""
+    theirs = f"{path}: task_name = {run.manifest['task']!r}, but the task is {config.task!r}"
+    try:
+        load_policy(path, privileged(config, env)[0], config)
+    except UserError as error:
+        how = str(error).removeprefix(f"{path}: ").partition(f": {MADE_WITH}")[0]
+        raise UserError(f"--checkpoint {theirs}; give a policy of {config.task} ({how})") from None
+    return f"{theirs}: both have as many observations and actions, and the policy is taken over as it is"
 
 
 def physics_settings(args: argparse.Namespace) -> dict[str, tuple[str, Any]]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bayessim_mjx import trust
+from bayessim_mjx.config import listing
 from bayessim_mjx.config.settings import (
     YAML_NAMES,
     BayesSimConfig,
@@ -29,7 +30,6 @@ SECTIONS: dict[str, type[Section]] = {
     "env": EnvConfig, "bayessim": BayesSimConfig, "ppo": PPOConfig, "real": RealConfig, "monitor": MonitorConfig,
 }  # fmt: skip
 TOP_KEYS = [YAML_NAMES.get(f.name, f.name) for f in dataclasses.fields(Config)]
-PAGE = "docs/settings.md"  # that lists all keys
 REAL_KEYS = ("weights", "means", "stds")
 EFFECTS_SCHEMA = 1
 EFFECTS_KEYS = ("schema", "effects", "calibrated")
@@ -48,7 +48,7 @@ def merge(merged: dict[str, Any], raw: Mapping[str, Any], source: str, is_file: 
     """Check one layer and write it over what is there; the layer itself is never changed."""
     for key, value in _with_effects(raw, source, is_file).items():
         if key not in TOP_KEYS:
-            raise unknown(f"{source}: key", str(key), TOP_KEYS + _dotted(str(key)), PAGE)
+            raise unknown(f"{source}: key", str(key), TOP_KEYS + _dotted(str(key)), listing.COMMAND)
         if key == "task_name":
             if value != merged["task_name"]:
                 raise UserError(f"{source}: task_name = {value!r}, but the task is {merged['task_name']!r}")
@@ -117,7 +117,9 @@ def _merge_section(
         elif key in extra:
             merged[key] = _like(value, declared[key], path, source)
         else:
-            raise unknown(f"{source}: key", path, [f"{section}.{k}" for k in [*fields, *extra]], PAGE)
+            raise unknown(
+                f"{source}: key", path, [f"{section}.{k}" for k in [*fields, *extra]], f"{listing.COMMAND} {section}"
+            )
 
 
 def _subsection(cls: type[Section], key: str) -> type[Section] | None:

@@ -22,8 +22,9 @@ class Finding:
 
     Attributes:
         part: observation, action, command, clock or file. kind: what is wrong, a word of `words.SENTENCES`.
-        entries: names; empty: all of the part. found, expected: numbers or words. left, before: share of the entries'
-            variance that is unexplained with and without this finding; None where it is no such share.
+        entries: names; empty: all of the part. found, expected: numbers or words. before, left: error of the
+            entries, or of the actions where no observation was logged, now and if this is mended, as a share of their
+            variance; None where it is not known.
     """
 
     part: str

@@ -79,7 +79,7 @@ def _group(evidence: Evidence, result: Result, entries: list[Entry], seen: Array
         return None
     plain = reference("", 0)
     assert plain is not None
-    before = float(np.mean(_left(seen, plain)))
+    before = _apart(seen, plain, kind)
     found = axes.findings(entries, seen, relation)
     found += judge("observation", entries, limited, relation, axes.turned(relation), result)
     if (
@@ -90,8 +90,10 @@ def _group(evidence: Evidence, result: Result, entries: list[Entry], seen: Array
         found = [Finding("observation", "command_fed_back", tuple(e.name for e in entries))]
     found = [f for f in found if not (slopes and _small(f))]
     found += _others(evidence, entries, limited, relation, result)
-    left = float(np.mean(relation.left))
-    result.findings += [replace(f, left=left, before=before) for f in axes.merged(entries, seen, found, relation)]
+    for f in axes.merged(entries, seen, found, relation):
+        own = [i for i, entry in enumerate(entries) if entry.name in f.entries]
+        now, mended = (float(np.mean(share[own])) for share in (before, relation.left))
+        result.findings.append(replace(f, left=mended, before=now))
     bad = {name for f in found for name in f.entries}
     right = [e.name for e, told in zip(entries, relation.told, strict=True) if told and e.name not in bad]
     result.compared.setdefault("observation", []).extend(right)
@@ -126,6 +128,15 @@ def _commands_back(evidence: Evidence, seen: Array, entries: Sequence[Entry]) ->
     rows = np.isfinite(seen).all(1) & np.isfinite(expected).all(1)
     rest = np.mean((seen[rows] - expected[rows]) ** 2) if rows.any() else np.inf
     return bool(rest < OTHER * np.mean(np.var(seen[rows], axis=0)))
+
+
+def _apart(seen: Array, expected: Array, kind: str) -> Array:
+    """[g] mean square of what was seen less what the manifest expects, as shares of the entries' variance."""
+    rows = np.isfinite(seen).all(1) & np.isfinite(expected).all(1)
+    y, x = seen[rows], expected[rows]
+    if kind == "quaternion":  # q and -q are one attitude
+        x = x * np.where((x * y).sum(1) < 0, -1.0, 1.0)[:, None]
+    return ((y - x) ** 2).sum(0) / np.maximum(((y - y.mean(0)) ** 2).sum(0), 1e-9)
 
 
 def _left(seen: Array, expected: Array) -> Array:

@@ -193,8 +193,8 @@ NOTES = {
     "no_commands": "no commands in the log (ctrl:<actuator>): scale, offset and order of commands are unknown",
     "rebuilt": "no observations in the log: the actions follow from the logged state as the manifest says",
     "rebuilt_unlike": (
-        "no observations in the log, and the actions do not follow from the logged state by any single mistake that "
-        "was tried: noise, several mistakes, or another policy; log the policy's observations (observation:<name>)"
+        "no observations in the log, and no single mistake that was tried explains the actions: several mistakes, "
+        "another policy, or noise of the log; log the policy's observations (observation:<name>), which tell them apart"
     ),
     "not_rebuilt": "no observations in the log, and its state does not give all of them: log observation:<name>",
     "no_scale": "commands are no multiples of the actions: they are not compared",
@@ -227,11 +227,11 @@ def sentence(finding: Finding) -> str:
 
 
 def evidence(finding: Finding) -> str:
-    """How much of the entries' variance is unexplained before and after the finding; "" where it is not known."""
+    """Error now and if the finding is mended, as shares of the variance; "" where it is not known."""
     if finding.left is None or finding.before is None:
         return ""
-    before = percent(finding.before) if finding.before <= 1 else "more than all"
-    return f"{before} to {percent(round(finding.left, 4))}"
+    now = percent(finding.before) if finding.before <= 1 else "over 100 %"
+    return f"{now}, {percent(round(finding.left, 4))}"
 
 
 def right(part: str, names: Sequence[str]) -> str:
@@ -276,11 +276,26 @@ def verdict(result: Result) -> str:
     if result.findings:
         n = len(result.findings)
         return f"{n} thing{'s' if n > 1 else ''} of the deployed policy differ{'' if n > 1 else 's'} from its file"
+    if unlike(result):
+        return "differs: the actions do not follow from the logged state"
     if not shows(result):
         return NOTHING
-    if "rebuilt_unlike" in result.notes:
-        return "the log does not show whether the policy is deployed as its file says"
-    return "the deployed policy is as its file says, in all that the log shows"
+    if result.untold:
+        hidden = listed(list(result.untold), most=MOST)
+        return f"the deployed policy is as its file says, except {hidden}, which the log does not show"
+    return "the deployed policy is as its file says"
+
+
+def unlike(result: Result) -> bool:
+    """Whether the actions follow from the logged state neither by the file nor by a mistake that was tried."""
+    return "rebuilt_unlike" in result.notes
+
+
+def outcome(result: Result) -> str:
+    """Return the verdict as a word: differs, right, or not compared."""
+    if result.findings or unlike(result):
+        return "differs"
+    return "right" if shows(result) else "not compared"
 
 
 def _text(value: float | str | None) -> str:

@@ -15,6 +15,8 @@ from bayessim_mjx.config.settings import IMPLEMENTATIONS, implementation
 from bayessim_mjx.effects.effect import Effect
 from bayessim_mjx.effects.support.reading import stack
 from bayessim_mjx.effects.support.storage import corrected
+from bayessim_mjx.env import answers
+from bayessim_mjx.env.finite import counted, finite
 from bayessim_mjx.env.protocol import Env, Observations, State
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import Mirror, resolve
@@ -43,7 +45,8 @@ class Task(Env):
         calibrated: parameters of the model as identified by a diagnosis; see `effects.support.storage.corrected`.
 
     A world that is no longer finite, or where a velocity reaches `speed_limit`, counts as diverged: it stays in its
-    last sound state, and the episode terminates with the reward `diverged_reward`. Observations are always finite.
+    last sound state, and the episode terminates with the reward `diverged_reward`. The learner always gets finite
+    numbers: what else a method returns that is none counts as 0, and the metrics `not_finite_<part>` tell where.
 
     Raises:
         UserError: on an unknown setting or variant; ValueError: on bad parameters or effects.
@@ -162,7 +165,7 @@ class Task(Env):
             key, key_drawn = jax.random.split(key)
             drawn = self.nuisance.begin(key_drawn, course, self.action_size)
         key, key_start = jax.random.split(key)
-        qpos, qvel = self.initial(key)
+        qpos, qvel = answers.begun(self.name, self.initial(key), self.mj_model.nq, self.mj_model.nv)
         return self._begin(key_start, qpos, qvel, theta, drawn)
 
     def reset_to(self, qpos: jax.Array, qvel: jax.Array, theta: jax.Array | None = None) -> State:
@@ -184,14 +187,16 @@ class Task(Env):
         world = self._under_gravity(self.physics.world(theta, qpos, qvel, key), drawn)
         world = world.replace(task={"steps": jnp.zeros((), jnp.int32)} | self.start(key, world))
         data, action = self.physics.kinematics(world), jnp.zeros(self.action_size)
-        metrics = [*jax.eval_shape(lambda: self.reward(world, world, data, action)[2]), *self._counted(data)]
-        (drawn, obs), zero = self._observe(world, data, action, drawn), jnp.zeros(())
+        drawn, obs, told = self._observe(world, data, action, drawn)
+        zero, named = jnp.zeros(()), jax.eval_shape(lambda: self._rewarded(world, world, data, action)[2])
+        metrics = {name: zero for name in (*named, *self._overflow(data))}
+        metrics |= counted(True, told, zero, dict.fromkeys(named, zero))
         return State(
             pipeline_state=world,
             obs=obs,
             reward=zero,
             done=zero,
-            metrics={name: zero for name in metrics},
+            metrics=metrics,
             info={"terminated": zero, "truncated": zero, "final_observation": obs, "steps": world.task["steps"]}
             | ({} if drawn is None else {"nuisance": drawn}),
         )
@@ -210,14 +215,16 @@ class Task(Env):
             drawn = self.nuisance.after_step(drawn)
         action = jnp.clip(action, -1.0, 1.0)
         before, command = self.actuate(before, action)
+        command = answers.commanded(self.name, command, self.action_size)
         after, data = control_step(self.physics, before, command)
-        counted = self._counted(data)
+        lost = self._overflow(data)
         after, sound = _hold_if_diverged(before, after, self.speed_limit)
         steps = before.task["steps"] + 1
         after = after.replace(task=after.task | {"steps": steps})
         after = self.advance(before, after, data, action)
-        reward, terminated, metrics = self.reward(before, after, data, action)
-        drawn, obs = self._observe(after, data, action, drawn)
+        reward, terminated, metrics = self._rewarded(before, after, data, action)
+        drawn, obs, told = self._observe(after, data, action, drawn)
+        lost |= counted(sound, told, reward, metrics)
         done = (terminated | ~sound).astype(jnp.float32)
         info = state.info | {
             "terminated": done,
@@ -231,22 +238,29 @@ class Task(Env):
         return State(
             pipeline_state=after,
             obs=obs,
-            reward=_finite(jnp.where(sound, reward, self.diverged_reward)),
+            reward=finite(jnp.where(sound, reward, self.diverged_reward)),
             done=done,
             # Brax adds its own
-            metrics=state.metrics | {name: _finite(value) for name, value in metrics.items()} | counted,
+            metrics=state.metrics | {name: finite(value) for name, value in metrics.items()} | lost,
             info=info,
         )
 
-    def _counted(self, data: mjx.Data) -> dict[str, jax.Array]:
+    def _rewarded(
+        self, before: World, after: World, data: mjx.Data, action: jax.Array
+    ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
+        return answers.rewarded(self.name, self.reward(before, after, data, action))
+
+    def _overflow(self, data: mjx.Data) -> dict[str, jax.Array]:
         """Count what the physics could not simulate of a control step, as metrics."""
         return {} if self.physics.warp is None else {OVERFLOW: overflowed(data)}
 
     def _observe(
         self, world: World, data: mjx.Data, action: jax.Array, drawn: Drawn | None
-    ) -> tuple[Drawn | None, Observations]:
+    ) -> tuple[Drawn | None, Observations, Observations]:
+        """Return (what was drawn, what is seen, what `observe` returned)."""
         limit = self.observation_clip[self.variant]
-        obs = {name: _finite(value) for name, value in self.observe(world, data, action).items()}
+        told = answers.observed(self.name, self.observe(world, data, action))
+        obs = {name: finite(value) for name, value in told.items()}
         if (names := len(self.observation_names)) != (numbers := obs["policy"].size):
             counts = f"{names} observation_names for an observation of {numbers} numbers"
             raise UserError(f"{self.name} has {counts}: name each number once")
@@ -257,7 +271,7 @@ class Task(Env):
         if limit is not None:
             obs = {name: jnp.clip(value, -limit, limit) for name, value in obs.items()}
         aliases = {"state": "policy", "privileged_state": "critic"}
-        return drawn, obs | {alias: obs[group] for alias, group in aliases.items() if group in obs}
+        return drawn, obs | {alias: obs[group] for alias, group in aliases.items() if group in obs}, told
 
     # Facts.
 
@@ -294,10 +308,6 @@ def _hold_if_diverged(before: World, after: World, speed_limit: float) -> tuple[
         for name in keep
     }
     return after.replace(**held), sound
-
-
-def _finite(x: jax.Array) -> jax.Array:
-    return jnp.where(jnp.isfinite(x), x, 0.0)
 
 
 def _names(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> tuple[str, ...]:

@@ -24,9 +24,10 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.inference.numbers import ALPHA, DRAWS, FEW, NEGLIGIBLE
 from bayessim_mjx.inference.temperature import LEVELS, TEMPERATURES, temperature, widened
 from bayessim_mjx.keys import branch
-from bayessim_mjx.quantities import MOST, listed, percent, percent_estimate
+from bayessim_mjx.quantities import MOST, listed, p_value, percent, percent_estimate
 
 FEWEST = round(1 / (1 - LEVELS[-1]))  # pairs that a verdict needs: one of them lies outside the largest region
+SHARE = ALPHA / 4  # of each family of tests: bias, spread, HPD levels, ranks
 CALIBRATED, OVER, UNDER, BIASED, ODD = "calibrated", "over-confident", "under-confident", "biased", "miscalibrated"
 HOW = ("narrow", "wide")  # widths of an over-confident and an under-confident posterior
 
@@ -136,7 +137,21 @@ class Report:
     @property
     def limit(self) -> float:
         """p-value of ranks below which they are a fault: all tests together find one by chance in ALPHA of cases."""
-        return ALPHA / 4 / len(self.p)  # see `_verdict`
+        return SHARE / len(self.p)
+
+    @property
+    def moment_limit(self) -> float:
+        """The same of the mean of a parameter's ranks, and of their spread."""
+        return SHARE / len(self.names)
+
+    def moments(self) -> dict[str, str]:
+        """{parameter: `spread p = 0.0004`} where mean or spread of its ranks is a fault, which their curve may hide."""
+        found = {}
+        for name, bias, spread in zip(self.names, self.bias, self.spread, strict=True):
+            p, what = min((_two_sided(bias), "mean"), (_two_sided(spread), "spread"))
+            if p < self.moment_limit:
+                found[name] = f"{what} {p_value(p)}"
+        return found
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
@@ -196,29 +211,36 @@ def _verdict(
 ) -> tuple[str, str, tuple[int, ...]]:
     """(verdict, sentence, parameters on whose widths alone it rests).
 
-    Each of four families of tests has a quarter of ALPHA, shared by its members.
+    Each family of tests has its SHARE, shared by its members. The sentence names the test that decides, its p-value and
+    its limit.
     """
+
+    def against(p: float, limit: float) -> str:
+        return f"({p_value(p)}, a fault below {limit:.3g})"
+
     families = [*([_two_sided(z) for z in family] for family in (bias, spread, [level])), list(p.values())]
-    limit = ALPHA / len(families)
-    biased = [i for i in range(len(names)) if _two_sided(bias[i]) < limit / len(names)]
-    odd_width = [i for i in range(len(names)) if _two_sided(spread[i]) < limit / len(names)]
-    joint = _two_sided(level) < limit
+    means, widths, [joint], _ = families
+    each = SHARE / len(names)
+    biased = [i for i in range(len(names)) if means[i] < each]
+    odd_width = [i for i in range(len(names)) if widths[i] < each]
     if biased:
         sides = [f"{names[i]} (the truth is {'above' if bias[i] > 0 else 'below'})" for i in biased]
-        return BIASED, f"biased in {', '.join(sides)}", ()
-    if joint:
+        return BIASED, f"biased in {', '.join(sides)}, by the mean of the ranks {against(min(means), each)}", ()
+    if joint < SHARE:
         kind, how = (OVER, HOW[0]) if level > 0 else (UNDER, HOW[1])
         most = int(np.argmax(np.sign(level) * spread))
         where = f", most in {names[most]}" if most in odd_width and len(names) > 1 else ""
-        return kind, f"{kind}: too {how}{where}", ()
+        return kind, f"{kind}: too {how}{where}, by the mean HPD level {against(joint, SHARE)}", ()
     if odd_width:
         kind, order = (OVER, HOW) if spread[odd_width].sum() > 0 else (UNDER, HOW[::-1])
         odd = {how: [names[i] for i in odd_width if (spread[i] > 0) == (how == "narrow")] for how in order}
         texts = [f"too {how} in {listed(own, most=MOST)}" for how, own in odd.items() if own]
-        return kind, f"{kind}: {', '.join(texts)}", tuple(odd_width)
+        test = f"by the spread of the ranks {against(min(widths), each)}"
+        return kind, f"{kind}: {', '.join(texts)}, {test}", tuple(odd_width)
     worst = min(p, key=lambda name: p[name])
-    if p[worst] < limit / len(p):
-        return ODD, f"{ODD}: the ranks of {worst} are not uniform (p = {p[worst]:.1g}), the shape is wrong", ()
+    if p[worst] < SHARE / len(p):
+        test = against(p[worst], SHARE / len(p))
+        return ODD, f"{ODD}: the ranks of {worst} are not uniform {test}, the shape is wrong", ()
     together, lowest = min((len(families) * len(family) * min(family), min(family)) for family in families)
     if together > NEGLIGIBLE:
         return CALIBRATED, CALIBRATED, ()

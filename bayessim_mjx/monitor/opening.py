@@ -32,7 +32,7 @@ def opening(config: Config, env: Any, device: Any, infers: bool = True) -> dict[
         drawn = "" if config.env.realParams is not None else ", drawn by the seed (env.realParams sets them)"
         surrogate = f"surrogate: the simulator at hidden parameters{drawn}"
         lines["real side"] = f"recorded motion in {logs}" if logs else surrogate
-        if _exact(config, env):
+        if exact(config, env):
             lines["noise"] = NO_NOISE
     lines["budget"] = _budget(config, infers)
     if infers and config.bayessim.modelClass is not None:
@@ -63,7 +63,7 @@ def _none(config: Config) -> str:
     )
 
 
-def _exact(config: Config, env: Any) -> bool:
+def exact(config: Config, env: Any) -> bool:
     """Whether the posterior is that of a surrogate whose sensors add nothing."""
     infers = config.bayessim.modelClass is not None and len(env.space) > 0
     drawn = getattr(getattr(env, "nuisance", None), "observations", None)  # noise of the task's own section

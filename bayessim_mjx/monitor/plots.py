@@ -197,8 +197,15 @@ def _coverage(axes: Any, report: Any) -> None:
     half = BAND / np.sqrt(report.pairs)
     low, high = np.maximum(at - half, 0), np.minimum(at + half, 1)
     axes.fill_between(at, low, high, color=GREY, alpha=0.2, lw=0, label=STAYS)
-    axes.plot(at, _ecdf(report.ranks.level, at), color=BLUE, lw=2, label="densest regions (HPD)")
-    axes.plot(at, _ecdf(report.ranks.tarp, at), color=GREEN, lw=1.5, ls="--", label="regions around a point (TARP)")
+    axes.plot(
+        at,
+        _ecdf(report.ranks.level, at),
+        color=BLUE,
+        lw=2,
+        label=f"densest regions (HPD{_of_ranks(report, 'HPD level')})",
+    )
+    label = f"regions around a point (TARP{_of_ranks(report, 'TARP')})"
+    axes.plot(at, _ecdf(report.ranks.tarp, at), color=GREEN, lw=1.5, ls="--", label=label)
     for name, masses in report.intervals().items():  # the verdict rests on these
         axes.plot(at, _ecdf(masses, at), color=RED, lw=1.5, label=f"intervals of {shorten([name], 30)[0]}")
     for level, (share, error) in report.coverage.items():
@@ -212,6 +219,11 @@ def _coverage(axes: Any, report: Any) -> None:
     rows = [f"{percent(level)}:  {percent_estimate(share, error, 1)}" for level, (share, error) in shares.items()]
     text = "\n".join([shorten([what], 36)[0], *rows])
     axes.text(0.97, 0.03, text, ha="right", va="bottom", fontsize=8, linespacing=1.4, transform=axes.transAxes)
+
+
+def _of_ranks(report: Any, test: str) -> str:
+    """`, p = 0.24` that the ranks of a test of all parameters are uniform."""
+    return f", p = {report.p[test]:.2g}"
 
 
 def _sets(axes: Any, sets: Any) -> None:
@@ -238,14 +250,16 @@ def _ranks(axes: Any, report: Any) -> None:
     at, n = np.linspace(0, 1, 201), report.pairs
     half = BAND / np.sqrt(n)
     axes.axhspan(-half, half, color=GREY, alpha=0.2, lw=0, label=STAYS)
-    worst = np.argsort([report.p[name] for name in report.names])
+    faults = report.moments()
+    worst = sorted(range(len(report.names)), key=lambda i: (report.names[i] not in faults, report.p[report.names[i]]))
     from matplotlib import colormaps
 
     colours = [RED, *colormaps["viridis"](np.linspace(0.1, 0.9, MOST - 1))]
     for k, i in enumerate(worst):
         style: dict[str, Any] = {"color": GREY, "alpha": 0.4}
         if k < MOST:
-            name = f"{shorten(report.names, 34)[i]} (p = {report.p[report.names[i]]:.2g})"
+            also = f"; {faults[report.names[i]]}" if report.names[i] in faults else ""
+            name = f"{shorten(report.names, 34)[i]} (p = {report.p[report.names[i]]:.2g}{also})"
             style = {"color": colours[k], "label": name}
         axes.plot(at, _ecdf(report.ranks.parameters[:, i], at) - at, lw=1.4, **style)
     axes.axhline(0, color="black", lw=0.6)
@@ -253,7 +267,8 @@ def _ranks(axes: Any, report: Any) -> None:
     shapes = (
         "ranks: a hump is a posterior too high, a dip one too low;\nup then down is too narrow, down then up too wide"
     )
-    axes.set_title(f"{shapes}\na fault: p below {report.limit:.1g}", fontsize=9, loc="left")
+    limits = f"a fault: p below {report.limit:.3g}; of mean or spread of ranks, below {report.moment_limit:.3g}"
+    axes.set_title(f"{shapes}\n{limits}", fontsize=9, loc="left")
     low, high = axes.get_ylim()
     wide = max(-low, high, 2 * half)
     lines = min(len(worst), MOST) + 1

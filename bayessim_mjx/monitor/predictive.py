@@ -23,6 +23,7 @@ def predictive(
     round: int | None = None,
     most: int = 8,
     lines: int = 4,
+    own: str = "real",
 ) -> Any:
     """Real motion against the 50 and 90 % bands of simulated motion and a few single simulations.
 
@@ -33,6 +34,7 @@ def predictive(
         units: {channel: unit}; a channel `qpos:elbow` or `qvel:elbow` is called by its quantity and joint.
         before: {channel: [n, T]} the same under the prior, drawn as a pale band.
         most: at most so many channels; of more, the worst explained ones, worst first. lines: single simulations.
+        own: what the legend calls the real motion.
     Raises:
         ValueError: no channel in common, or a length that is not T.
     """
@@ -50,16 +52,17 @@ def predictive(
         axes.remove()
     for k, (axes, name) in enumerate(zip(grid, shown, strict=False)):
         pale = None if before is None or name not in before else _rows(before[name], time, name)
-        unit, (own, others), thin = (units or {}).get(name, ""), data[name], _thin(*data[name])
+        unit, (measured, others), thin = (units or {}).get(name, ""), data[name], _thin(*data[name])
         zero = _percentiles(others, [50])[0] if thin else 0.0
-        _channel(axes, time, own - zero, others - zero, None if pale is None else pale - zero, lines)
-        axes.set_title(_title(name, unit, own, others, thin), fontsize=9, loc="left")
+        _channel(axes, time, measured - zero, others - zero, None if pale is None else pale - zero, lines)
+        axes.set_title(_title(name, unit, measured, others, thin), fontsize=9, loc="left")
         axes.set_ylabel(_axis(name, unit, thin), fontsize=8)
         if k >= len(shown) - columns:
             axes.set_xlabel("time [s]", fontsize=8)
             axes.tick_params(labelbottom=True)
     items = ["real", "draw", "band90", "band50"] + ["before"] * (before is not None)
     marks, texts = handles(items)
+    texts = [own if item == "real" else text for item, text in zip(items, texts, strict=True)]
     figure.legend(marks, texts, loc="outside lower center", ncols=len(items), frameon=False, fontsize=8)
     few = f", {len(shown)} of {len(ranked)} channels, worst explained first" if len(ranked) > most else ""
     figure.suptitle(heading(title, round) + few, fontsize=11)

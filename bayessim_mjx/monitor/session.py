@@ -18,6 +18,7 @@ from bayessim_mjx.monitor import plots, video
 from bayessim_mjx.monitor.clock import CompileClock
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.film import FPS, Motion, frames
+from bayessim_mjx.monitor.opening import exact
 from bayessim_mjx.monitor.writers import Wall, Writer, opened
 from bayessim_mjx.rl import Policy, policy_of
 
@@ -178,11 +179,10 @@ class Session:
         if info.predictive is not None and info.real is not None:
             real, simulated = channels(self.env.mj_model, info)
             clock = np.arange(info.real.qpos.shape[1]) * self.env.dt
-            self.inference.figure(
-                "BayesSim/posterior_predictive",
-                plots.predictive(clock, real, simulated, units=units(self.env.mj_model), round=step),
-                step,
-            )
+            # a surrogate whose sensors add nothing is seen as it moves
+            own = "true motion" if exact(self.config, self.env) else "real"
+            picture = plots.predictive(clock, real, simulated, units=units(self.env.mj_model), round=step, own=own)
+            self.inference.figure("BayesSim/posterior_predictive", picture, step)
 
     def _video(self, writer: Writer, tag: str, policy: Policy, step: int, title: str, half: bool = False) -> None:
         assert self.film is not None

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from bayessim_mjx.physics.warp import OVERFLOW
 from bayessim_mjx.rl.sharding import FIRST
 from bayessim_mjx.rollout.collection import TERM, kept
 
@@ -78,7 +77,7 @@ def tags_of_terms(metrics: dict[str, Any]) -> dict[str, str]:
 
 
 def _tag(name: str) -> str:
-    return f"Train/{name}" if name == OVERFLOW else f"Reward/{name.removeprefix(TERM)}"
+    return f"Reward/{name.removeprefix(TERM)}" if name.startswith(TERM) else f"Train/{name}"
 
 
 def terms(data: dict[str, Any]) -> dict[str, jax.Array]:

@@ -11,8 +11,10 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.compat import program
+from bayessim_mjx.env.finite import NOT_FINITE
 from bayessim_mjx.keys import branch
 from bayessim_mjx.physics.warp import OVERFLOW, refuse_overflow
+from bayessim_mjx.rl import not_finite
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rollout import traced
 
@@ -39,7 +41,7 @@ def evaluate(
     thetas = jnp.asarray(thetas, jnp.float32)
     if thetas.ndim != 2:
         raise ValueError(f"thetas has shape {thetas.shape}: expected [episodes, parameters]")
-    return _sound(_evaluate(env)(dataclasses.replace(policy, deterministic=deterministic), key, thetas))
+    return _sound(env, _evaluate(env)(dataclasses.replace(policy, deterministic=deterministic), key, thetas))
 
 
 def evaluate_together(
@@ -62,11 +64,12 @@ def evaluate_together(
     if thetas.ndim != 3 or len(thetas) != len(policies):
         raise ValueError(f"thetas has shape {thetas.shape}: expected [{len(policies)} policies, episodes, parameters]")
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *policies)
-    return _sound(_evaluate_together(env)(dataclasses.replace(stacked, deterministic=deterministic), key, thetas))
+    return _sound(env, _evaluate_together(env)(dataclasses.replace(stacked, deterministic=deterministic), key, thetas))
 
 
-def _sound(found: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """Return what was found, where all contacts had room."""
+def _sound(env: Env, found: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Return what was found, where all contacts had room; warn of numbers that are not finite."""
+    not_finite.evaluated(env, {name: found.pop(name) for name in [*found] if name.startswith(NOT_FINITE)})
     if (lost := found.pop(OVERFLOW, None)) is not None:
         refuse_overflow(lost.mean(), "the episodes that were evaluated")
     return found
@@ -96,10 +99,11 @@ def _episodes(env: Env) -> Callable[..., dict[str, jax.Array]]:
             state = jax.vmap(traced(env.step))(state, policy(branch(key, t), state.obs))
             total, length = total + jnp.where(alive, state.reward, 0.0), length + alive
             ended = state.info["terminated"] + state.info["truncated"] > 0
-            lost = {name: jnp.maximum(most, state.metrics[name]) for name, most in lost.items()}
+            lost = {name: jnp.maximum(most, jnp.where(alive, state.metrics[name], 0)) for name, most in lost.items()}
             return t + 1, state, alive & ~ended, total, length, lost
 
-        lost = {OVERFLOW: jnp.zeros(count)} if OVERFLOW in getattr(state, "metrics", {}) else {}
+        metrics = getattr(state, "metrics", {})
+        lost = {name: jnp.zeros(count) for name in metrics if name == OVERFLOW or name.startswith(NOT_FINITE)}
         carry = (jnp.int32(0), state, jnp.ones(count, bool), jnp.zeros(count), jnp.zeros(count, jnp.int32), lost)
         _, _, _, total, length, lost = jax.lax.while_loop(going, step, carry)
         return {"return": total, "length": length} | lost

@@ -20,7 +20,7 @@ from bayessim_mjx.errors import DivergedError, UserError
 from bayessim_mjx.physics.warp import OVERFLOW, refuse_overflow
 from bayessim_mjx.progress import shown
 from bayessim_mjx.quantities import compact, is_number
-from bayessim_mjx.rl import catalogue, checks, distil, episodes, ppo, sharding
+from bayessim_mjx.rl import catalogue, checks, distil, episodes, not_finite, ppo, sharding
 from bayessim_mjx.rl.networks import Policy
 from bayessim_mjx.rl.state import TrainState, policy_of
 
@@ -123,6 +123,7 @@ def run(
     iterations: int | None = None,
     progress: Callable[[Metrics, TrainState], None] | None = None,
     teacher: Policy | None = None,
+    seen: dict[str, int] | None = None,
 ) -> tuple[TrainState, Metrics]:
     """Run `iterations` more updates: the new state, and metrics of the last interval.
 
@@ -136,15 +137,17 @@ def run(
         progress: called with the metrics and the state of each interval. That state's buffers are reused by the next
             interval: copy what is to be kept.
         teacher: its actions are imitated, see `distil`; None: PPO.
+        seen: {tag: iteration} of what the task returned without being finite, to be told once in several calls.
 
     Raises:
         DivergedError: the loss is no longer finite.
-        UserError: contacts had no room (`physics.warp`).
+        UserError: contacts had no room (`physics.warp`); the task's numbers are not finite as training begins.
     """
     total = config.max_iterations if iterations is None else iterations
     state = sharding.put(state, state.mesh, ppo.layout(state))  # the caller's state stays valid
     given = _given(domain, teacher, state.mesh)
-    done, metrics = 0, {}
+    done, metrics, seen = 0, {}, {} if seen is None else seen
+    not_finite.at_reset(env, state)
     while done < total:
         count = min(config.log_interval, total - done)
         start = time.perf_counter()
@@ -158,6 +161,7 @@ def run(
                 "observations and rewards stay finite over the whole domain, and lower ppo.learning_rate"
             )
         refuse_overflow(metrics.get(f"Train/{OVERFLOW}", 0.0), f"the steps before iteration {int(state.iteration)}")
+        not_finite.watch(env, metrics, int(state.iteration), int(state.iteration) == count, seen)
         metrics["Perf/total_fps"] = count * config.num_envs * config.num_steps / seconds
         metrics["Perf/iteration_time"] = seconds / count
         if progress is not None:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax.interpreters import partial_eval
 
+from bayessim_mjx.env.finite import NOT_FINITE
 from bayessim_mjx.physics.warp import OVERFLOW
 from bayessim_mjx.rollout.episodes import PolicyFn, select, traced
 
@@ -21,8 +22,8 @@ TERM = "reward_"  # how metrics are called that are parts of the reward
 
 
 def kept(name: str) -> bool:
-    """Whether collection keeps the metric: parts of the reward, and what the physics could not simulate."""
-    return name.startswith(TERM) or name == OVERFLOW
+    """Whether collection keeps the metric: parts of the reward, and what was not simulated or is no number."""
+    return name.startswith((TERM, NOT_FINITE)) or name == OVERFLOW
 
 
 def collect(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bayessim_mjx import cli, config, main, play, registry
+from bayessim_mjx import cli, config, loop, main, play, registry
 from bayessim_mjx.runs import Run, latest_run
 from tests.commands.toy_runs import LOOP, SMALL, Killed, checkpoint_of, killed_after, repeated_events
 
@@ -38,6 +38,16 @@ def test_main_stops_only_after_the_rounds_checkpoint() -> None:
         watched.save(5, {"state": types.SimpleNamespace(round=1)}, meta={})
     watched.save(10, {"state": types.SimpleNamespace(round=2)}, meta={})  # the last one: none is left
     assert calls == ["round", (5, 7), (10, 7)]
+
+
+def test_ctrl_c_while_main_compiles_says_that_nothing_was_written(toy: None, monkeypatch: Any, capsys: Any) -> None:
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop, "make", stopped)
+    assert main.main(["main", "--task", "Pendulum", *SMALL, *LOOP]) == 130
+    assert "interrupted while compiling: nothing was written" in capsys.readouterr().out
+    assert not Path("logs/Pendulum").exists()
 
 
 @pytest.mark.slow

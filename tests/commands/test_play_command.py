@@ -63,7 +63,7 @@ def test_play_prints_returns_of_latest_best_run_and_path(toy: None, capsys: pyte
     pytest.importorskip("onnxruntime", reason="the extra [export] is not installed")
     for flags in ([], ["deploy/p.onnx"]):
         assert play.main(["--checkpoint", str(run.checkpoint(2)), "--export", *flags]) == 0
-        where, _, rest = capsys.readouterr().out.rpartition("exported ")[2].partition(": differs by ")
+        where, _, rest = capsys.readouterr().out.rpartition("exported ")[2].partition(": its actions differ by ")
         assert float(rest.split()[0]) < 1e-5 and Path(where).is_file()
     assert where == "deploy/p.onnx"
     assert play.main(["--checkpoint", str(run.checkpoint(2)), "--episodes", "2", "--hub", "hub"]) == 0

@@ -63,7 +63,7 @@ WRONG = {
     f"{DIAGNOSE} --minutes -3": "--minutes: '-3': allowed: minutes, more than 0",
     "main --seed 1": "no task: give --task NAME (--list_tasks shows the names)",
     "main --task Pendlum": "--task 'Pendlum' is unknown. Did you mean Pendulum",
-    "main --task Pendulum bayessim.component=5": "Did you mean bayessim.components? Allowed: those in docs/settings.md",
+    "main --task Pendulum bayessim.component=5": "Allowed: those that `bayessim-mjx help settings bayessim` prints",
     "main --task Pendulum --cfg_env slip.yaml": "slip.yaml: key 'bayessim.component' is unknown",
     "main --task Pendulum --cfg_env bad.yaml": "bad.yaml, line 1: not valid YAML",
     "main --task Pendulum --cfg_env empty": "empty: cannot be read: not a file",
@@ -104,6 +104,8 @@ WRONG = {
     "blind --model arm.xml --out note.txt": "--out note.txt: there is a file of that name; give a folder",
     "implementations --task Nothing": "--task 'Nothing' is unknown. Allowed: Ant",
     "implementations --task Pendulum --seconds 0": "--seconds: '0': allowed: seconds, more than 0",
+    "help settings pp": "section of settings 'pp' is unknown. Did you mean ppo? Allowed: env, bayessim,",
+    "help settings ppo gamma": "help settings ppo gamma: give one section, such as ppo",
     "completion ksh": "shell 'ksh' is unknown. Did you mean zsh? Allowed: bash, zsh, fish",
 }
 

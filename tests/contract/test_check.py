@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("onnxruntime", reason="the extra [export] is not installed")
 pytest.importorskip("onnx", reason="the extra [export] is not installed")
 
+from bayessim_mjx.contract import words  # noqa: E402
 from bayessim_mjx.contract.check import check  # noqa: E402
 from bayessim_mjx.contract.evidence import Result  # noqa: E402
 from tests.contract import robots  # noqa: E402
@@ -122,6 +123,35 @@ def test_mistakes_are_found_through_the_network_where_no_observation_is_logged(
     observation, truth = WRONG[case]
     robots.write_log(tmp_path / "run.csv", observation, drop=STATE_ONLY)
     assert found(check(policy, tmp_path)) == {("observation", kind, entries) for kind, entries in truth}
+
+
+def of_a_circle() -> dict[str, Any]:
+    """The manifest of a policy that sees sine and cosine of the hip in place of both joints' angles."""
+    facts = robots.manifest()
+    for i, source in enumerate(("sin:hip", "cos:hip")):
+        facts["observation_meaning"][6 + i] = {"terms": {source: 1.0}, "offset": 0.0, "unit": "rad"}
+    return facts
+
+
+@pytest.mark.parametrize("offset", [0.3, -2.0])  # rad
+def test_an_offset_of_a_joint_is_found_through_its_sine_and_cosine(offset: float, tmp_path: Path) -> None:
+    policy = robots.write_policy(tmp_path / "policy.onnx", of_a_circle())
+    turned = lambda m, k, x: [np.sin(m["q"][k][0] + offset), np.cos(m["q"][k][0] + offset)]  # noqa: E731
+    robots.write_log(tmp_path / "logs" / "run.csv", changed(PLACES, turned), drop=STATE_ONLY)
+    (finding,) = check(policy, tmp_path / "logs").findings
+    assert (finding.kind, finding.entries) == ("offset", names(PLACES))
+    assert finding.found == pytest.approx(offset, abs=1e-3)
+
+
+def test_the_error_now_is_that_of_the_mistake_and_not_of_a_line(policy: Path, tmp_path: Path) -> None:
+    """A flipped sign doubles the motion: four times its variance, and four times its squared mean."""
+    observation, _ = WRONG["hip"]
+    robots.write_log(tmp_path / "run.csv", observation)
+    (finding,) = check(policy, tmp_path).findings
+    seen = robots.motion(0, 300)["q"][:, 0] - HOME[0]
+    assert finding.before == pytest.approx(4 * np.mean(seen**2) / np.var(seen), rel=1e-6)
+    assert finding.left is not None and finding.left < 1e-5
+    assert words.evidence(finding) == "over 100 %, 0 %"
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.003, 0.03])

@@ -46,6 +46,27 @@ def test_a_log_that_shows_nothing_is_1_with_a_way_on(
     assert json.loads((tmp_path / "found.json").read_text())["verdict"] == "not compared"
 
 
+def test_another_policy_of_which_only_the_state_is_logged_differs(
+    policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    other = lambda o: np.tanh((o - 0.1) / 0.6 @ robots.weights(7))  # noqa: E731
+    log = robots.write_log(tmp_path / "logs" / "run.csv", acted=other, drop=("observation", "action"))
+    assert run(policy, "--logs", log, "--out", tmp_path / "found.json") == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert "differs: the actions do not follow from the logged state" in out and "error" not in out, out
+    assert json.loads((tmp_path / "found.json").read_text())["verdict"] == "differs"
+
+
+def test_what_is_right_names_what_the_log_does_not_show(
+    policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    robots.write_log(tmp_path / "logs" / "run.csv", drop=("qpos:hip", "qvel:hip"))
+    assert run(policy, "--logs", tmp_path / "logs") == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "the deployed policy is as its file says, except hip_position, " in out, out
+    assert out.endswith("which the log does not show")
+
+
 def test_bad_input_is_2(policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     log = robots.write_log(tmp_path / "logs" / "run.csv")
     assert run(tmp_path / "none.onnx", "--logs", tmp_path / "logs") == 2

@@ -180,12 +180,13 @@ def judged(narrow, wide=1.0, n=3000):
 def test_a_width_that_is_wrong_in_one_parameter_is_said_with_the_numbers_of_that_parameter():
     """The regions of all parameters hold enough: their numbers would contradict the verdict."""
     found = judged(0.8)
-    assert found.words == "over-confident: too narrow in a"
+    test = ", by the spread of the ranks (p < 1e-9, a fault below 0.00125)"
+    assert found.words == "over-confident: too narrow in a" + test
     assert found.evidence().startswith("intervals of a 50 %: 40") and "HPD" not in found.evidence()
     both = judged(0.7, 1.2)
-    assert both.words == "over-confident: too narrow in a, too wide in b"
+    assert both.words == "over-confident: too narrow in a, too wide in b" + test
     assert "; intervals of b 50 %: 59" in both.evidence()
-    assert judged(0.9, 1.4).words == "under-confident: too wide in b, too narrow in a"
+    assert judged(0.9, 1.4).words == "under-confident: too wide in b, too narrow in a" + test
     assert judged(1.0).evidence().startswith("HPD coverage 50 %: ")
 
 
@@ -193,7 +194,28 @@ def test_the_parameter_named_beside_the_regions_errs_as_they_do():
     """Too narrow together, and `most in` one that is too narrow, not in one that is too wide by more."""
     p = dict.fromkeys(("a", "b", "HPD level", "TARP"), 0.5)
     _, words, alone = calibration._verdict(("a", "b"), np.zeros(2), np.array([4.0, -9.0]), 5.0, p)
-    assert words == "over-confident: too narrow, most in a" and alone == ()
+    assert words.startswith("over-confident: too narrow, most in a, by the mean HPD level (p = 5.7e-07, a fault")
+    assert alone == ()
+
+
+@pytest.mark.parametrize(
+    ("bias", "spread", "level", "low", "words"),
+    [
+        (4.0, 0.0, 0.0, {}, "biased in a (the truth is above), by the mean of the ranks (p = 6.3e-05, a fault below"),
+        (
+            0.0,
+            3.4,
+            0.0,
+            {"a": 0.0029},
+            "too narrow in a, by the spread of the ranks (p = 0.00067, a fault below 0.00125",
+        ),
+        (0.0, 0.0, 0.0, {"TARP": 0.00024}, "the ranks of TARP are not uniform (p = 0.00024, a fault below 0.000625"),
+    ],
+)
+def test_the_sentence_names_the_test_that_decides_its_p_and_its_limit(bias, spread, level, low, words):
+    """By hand: 2 (1 - Phi(4)) = 6.3e-5, 2 (1 - Phi(3.4)) = 6.7e-4; a quarter of 1 %, shared by two, and by four."""
+    p = dict.fromkeys(("a", "b", "HPD level", "TARP"), 0.5) | low
+    assert words in calibration._verdict(("a", "b"), np.array([bias, 0]), np.array([spread, 0]), level, p)[1]
 
 
 def test_calibrated_states_a_low_p_and_what_all_tests_make_of_it():

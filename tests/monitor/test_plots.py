@@ -274,9 +274,10 @@ def report_of(d, pairs=300):
     rng, names = np.random.default_rng(d), tuple(f"left_front_leg_{i}_stiffness_mult" for i in range(d))
     ranks = SimpleNamespace(level=rng.random(pairs), tarp=rng.random(pairs), parameters=rng.random((pairs, d)))
     coverage = {0.5: (0.55, 0.029), 0.8: (0.81, 0.023), 0.95: (0.93, 0.013)}
+    p = dict.fromkeys((*names, "HPD level", "TARP"), 0.5)
     return SimpleNamespace(
-        pairs=pairs, names=names, words="calibrated", p=dict.fromkeys(names, 0.5), coverage=coverage, ranks=ranks,
-        intervals=dict, interval_coverage=dict, limit=0.001,
+        pairs=pairs, names=names, words="calibrated", p=p, coverage=coverage, ranks=ranks,
+        intervals=dict, interval_coverage=dict, limit=0.001, moments=dict, moment_limit=0.002,
     )  # fmt: skip
 
 
@@ -305,6 +306,11 @@ def test_a_calibration_picture_shows_the_intervals_that_its_title_rests_on():
     words = [text for text, _ in texts(figure)]
     assert "intervals of mass" in words and any("in use is that of the replays" in text for text in words)
     assert any("intervals of mass\n50 %:  40" in text for text in words)
+    assert any(text.startswith("mass (p = ") and "; spread p < 1e-9)" in text for text in words)
+    assert any("p below 0.000625; of mean or spread of ranks, below 0.00125" in text for text in words)
+    assert sum(f"TARP, p = {report.p['TARP']:.2g}" in text for text in words) == 1
+    title = " ".join(next(text for text in words if "network's posterior" in text).split())
+    assert "too narrow in mass, by the spread of the ranks (p < 1e-9, a fault below 0.00125)" in title
     assert overlaps(figure) == [] and outside(figure) == []
 
 
@@ -325,8 +331,9 @@ def test_predictive_axes_name_quantity_joint_and_unit():
     real = {f"{stream}:{joint}": np.sin(time) for stream in ("qpos", "qvel") for joint in ("elbow", "rail")}
     units = {"qpos:elbow": "rad", "qvel:elbow": "rad/s", "qpos:rail": "m", "qvel:rail": "m/s"}
     figure = plots.predictive(
-        time, real, {k: v + np.array([[-0.3], [0.0], [0.3]]) for k, v in real.items()}, units=units
+        time, real, {k: v + np.array([[-0.3], [0.0], [0.3]]) for k, v in real.items()}, units=units, own="true motion"
     )
+    assert "true motion" in [text for text, _ in texts(figure)]
     labels = {axes.get_ylabel().replace("\n", " ") for axes in figure.axes}
     assert labels == {
         "angle of elbow [rad]", "angular velocity of elbow [rad/s]", "position of rail [m]", "velocity of rail [m/s]",

@@ -3,6 +3,7 @@
 import copy
 import importlib.util
 import sys
+import time
 import types
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from bayessim_mjx import registry
+from bayessim_mjx import policy_check, registry
 from bayessim_mjx.config import PPOConfig
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.rl import export, networks, normalise
@@ -67,11 +68,45 @@ def test_a_second_of_it_is_a_log_with_the_policys_commands(deploy, policy, file,
 
 def test_a_step_takes_its_time(deploy, file, tmp_path, monkeypatch):
     """On the clock half a second lasts half a second."""
-    import time
-
     begun = time.perf_counter()
     assert run(deploy, monkeypatch, "--policy", file, "--seconds", 0.5, "--out", tmp_path, "--watchdog", 99) == 0
     assert time.perf_counter() - begun > 0.5
+
+
+def test_its_log_shows_that_the_policy_is_deployed_as_exported(deploy, file, tmp_path, monkeypatch, capsys):
+    options = ("--seconds", 5, "--spread", 3, "--out", tmp_path, "--fast", "--watchdog", 999, "--max_speed", 99)
+    assert run(deploy, monkeypatch, "--policy", file, *options) == 0
+    monkeypatch.setattr(deploy, "GOALS", {"speed": 0.5})  # a goal that this policy has no use for
+    assert run(deploy, monkeypatch, "--policy", file, *options, "--seed", 1) == 0
+    assert ",task:speed," in (tmp_path / "run_1.csv").read_text().splitlines()[0]
+    capsys.readouterr()
+    assert policy_check.main(["check", str(file), "--logs", str(tmp_path)]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "right: observation, 3 entries" in out and "right: action, 1 entry" in out
+    assert out.endswith("the deployed policy is as its file says")
+
+
+def test_a_late_step_is_late_in_the_log_and_for_the_robot(deploy):
+    """A block that slides at 1 m/s is where the clock says, although a step takes three times as long."""
+    import mujoco
+
+    xml = """<mujoco><option timestep="0.001"/><worldbody><body><joint name="rail" type="slide" axis="1 0 0"/>
+      <geom size=".1"/></body></worldbody><actuator><motor name="push" joint="rail"/></actuator></mujoco>"""
+    robot = deploy.Robot(mujoco.MjModel.from_xml_string(xml), ["rail"], ["push"], 0, spread=0.0)
+    robot.data.qvel[:] = 1.0
+
+    class Slow:
+        dt, calls = 0.02, 0
+
+        def __call__(self, q, w):
+            self.calls += 1
+            time.sleep(0.06 if self.calls == 3 else 0.0)
+            return np.zeros(1), np.zeros(1), np.zeros(1)
+
+    rows, _, reason = deploy.loop(Slow(), robot, deploy.Safety({}, 9.0, 9.0, 99), 0.2)
+    clock, place = np.array(rows)[:, [0, 4]].T
+    assert not reason and len(rows) == 10
+    assert np.diff(clock)[2] > 0.058 and place == pytest.approx(clock, abs=0.51e-3)  # half a timestep
 
 
 def test_it_stops_where_a_limit_is_passed(deploy, file, tmp_path, monkeypatch, capsys):

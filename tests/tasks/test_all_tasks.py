@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import registry
+from bayessim_mjx.env.finite import NOT_FINITE
 
 FAST = {"Pendulum", "Cartpole"}  # the others compile for up to half a minute
 LONG = {"FrankaCabinet", "Humanoid", "Ingenuity", "ShadowHand"}  # compile for a minute or more: not in CI either
@@ -55,6 +56,7 @@ def test_steps_stay_finite_over_the_whole_prior(task):
         state = task.step(state, action)
         leaves = jax.tree.leaves((state.obs, state.reward, state.done, state.metrics, state.pipeline_state))
         assert all(np.isfinite(leaf).all() for leaf in leaves)
+        assert not [n for n, x in state.metrics.items() if n.startswith(NOT_FINITE) and np.any(x)]  # 0 in their place
     assert jax.tree.structure(state) == reference  # scan and Brax's wrappers need a constant structure
     assert [leaf.dtype for leaf in jax.tree.leaves(state)] == types
     assert (np.asarray(state.info["steps"]) == 40).all()

@@ -162,8 +162,30 @@ def test_an_error_in_its_methods_names_the_line(tmp_path: Path) -> None:
     text = SLIDER.replace("-jnp.abs(after.qpos[0])", "-jnp.abs(after.position)")
     (tmp_path / "slider.py").write_text(text)
     line = 1 + text[: text.index("after.position")].count("\n")
-    with pytest.raises(UserError, match=rf"slider\.py:Slider, line {line}: AttributeError: .*position"):
+    with pytest.raises(UserError, match=rf"slider\.py:Slider, line {line} in `reward`: AttributeError: .*position"):
         registry.make("slider.py:Slider")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("-jnp.abs(after.qpos[0]), jnp.zeros((), bool), {}", "-jnp.abs(after.qpos[0])",
+         ["`reward` returned a number, but has to return (reward, terminated, metrics)"]),
+        ("-jnp.abs(after.qpos[0]), jnp", "-jnp.abs(after.qpos), jnp",
+         ["`reward` returned (an array of shape [1], a number, {})"]),
+        ('{"policy": jnp.concatenate([world.measurement["qpos"], world.measurement["qvel"]])}',
+         'world.measurement["qpos"]', ["`observe` returned an array of shape [1]", '{"policy": observation}']),
+        ("jnp.zeros(1), jnp.zeros(1)", "jnp.zeros(1), jnp.zeros(2)",
+         ["`initial` returned (an array of shape [1], an array of shape [2])", "of 1 and 1 numbers"]),
+        ("5.0 * action", "5.0 * action[0]", ["`command` returned a number", "a vector of 1"]),
+    ],
+)  # fmt: skip
+def test_a_method_that_returns_something_else_is_named(old: str, new: str, words: list[str], tmp_path: Path) -> None:
+    assert old in SLIDER
+    (tmp_path / "slider.py").write_text(SLIDER.replace(old, new))
+    with pytest.raises(UserError) as error:
+        registry.make("slider.py:Slider")
+    assert all(word in str(error.value) for word in ["task Slider: ", *words]), error.value
 
 
 def test_a_package_registers_tasks_by_entry_points(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
