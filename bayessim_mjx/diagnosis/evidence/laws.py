@@ -6,9 +6,9 @@ from elsewhere comes to rest far from them: a payload's place hardly moves anyth
 **Hidden** (`by_effects`). A bias beside a spring moves the spring's angle of rest; viscous friction beside friction by
 direction is part of it. Such logs do not tell whether both are there: the named law stands for both.
 
-**Stand-ins** (`stand_ins`, `by_parameters`). A joint's viscous friction is its damping, rotor inertia beside a slide is its mass, a
-drive's gain is all of the robot's inertia, damping and friction together. The prior decides whether the data sheet is
-wrong or an effect is missing.
+**Stand-ins** (`stand_ins`, `by_parameters`). A joint's viscous friction is its damping, rotor inertia beside a slide is
+its mass, a drive's gain is all of the robot's inertia, damping and friction together. The prior decides whether the
+data sheet is wrong or an effect is missing.
 """
 
 from __future__ import annotations
