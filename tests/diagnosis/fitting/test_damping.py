@@ -81,3 +81,22 @@ def test_a_step_as_promised_costs_one_simulation():
     (fit,) = fitter.iterate([start], 6, lambda f: [0])
     assert fit.values[0] == pytest.approx(LOAD, abs=0.02)
     assert made == [1] * len(fit.history)
+
+
+class Held(Loaded):
+    """A linear error: (LOAD - load) (1 + ALONG) and a start state that does nearly the same."""
+
+    def run(self, thetas, offsets):
+        error = (LOAD - np.asarray(thetas)[:, 0, None, None]) * (1 + ALONG) + 0.02 - offsets[..., 0, None]
+        return np.stack([error, np.zeros_like(error)], -1)
+
+
+@pytest.mark.parametrize("reach", [0.004, 0.25, 1.0])
+def test_a_step_gains_what_it_promises_however_much_start_states_are_damped(reach):
+    """A parameter's step that counts on start states to follow promises too much where they may not."""
+    fitter = Fitter(Held(), (), np.zeros(1))
+    fit = fitter.begin([Coordinate("load", (0,), 0.0, -9.0, 9.0, unit="")], np.array([0.1]))
+    fit, (values, offsets) = fitter._propose(dataclasses.replace(fit, reach=np.full(8, reach)))
+    r = fitter.whiten(fitter.simulator.run(values[None], offsets[None]))[0]
+    assert fit.cost - fitter.cost(fit, r, offsets, values) == pytest.approx(fit.promise, rel=1e-3)
+    assert 0 < fit.promise < fit.cost
