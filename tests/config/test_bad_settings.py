@@ -45,7 +45,7 @@ def test_memory_is_what_the_system_and_its_container_have(monkeypatch, tmp_path:
 
 
 BAD = {
-    "bayessim.componets=5": r"override 'bayessim.componets=5'.*mean bayessim\.components or .*Allowed: .*docs/settings",
+    "bayessim.componets=5": r"componets=5'.*mean bayessim\.components or .*Allowed: .*help settings bayessim",
     "componets=5": r"Did you mean bayessim\.components\?",
     "pp.gamma=1": r"key 'pp' is unknown.*ppo",
     "env.numEnv=5": r"Did you mean env\.numEnvs\?",
