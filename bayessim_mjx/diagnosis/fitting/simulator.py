@@ -189,10 +189,11 @@ class Simulator:
 
         What they show at the window's start is older than it. Simulated from there, each row of a window is predicted,
         and by all models from a state that was measured as long before: a late sensor is as likely as a late command.
+        The nearest row is taken: less than a row of a window is then older than its start, which is known.
         """
         if not self._late or not motion.start:
             return motion, jnp.int32(0)
-        steps = jnp.clip(jnp.ceil(jnp.max(late) - 1e-3), 0, motion.start).astype(jnp.int32)
+        steps = jnp.clip(jnp.round(jnp.max(late)), 0, motion.start).astype(jnp.int32)
         back = jnp.where(anew, steps, 0)
         rows = jnp.maximum(jnp.arange(len(motion.qpos)) - back, 0)
         moved = {name: getattr(motion, name)[rows] for name in ("qpos", "qvel", "command")}
