@@ -11,6 +11,7 @@ from pathlib import Path
 from bayessim_mjx.diagnosis.phrases.parameters import stand_ins
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.diagnosis.result import Verdict as Title
+from bayessim_mjx.diagnosis.statistics import of_rms
 from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import percent
 
@@ -90,6 +91,12 @@ PARTLY = Verdict(
     f"Train with effects.yaml for the effects found. {BELOW}. Write its cause as "
     "an effect of your own (--effects file.py:Name), or allow more with --tolerance.",
 )
+LITTLE = Verdict(
+    Title.UNEXPLAINED.words,
+    VERDICTS["unexplained"].headline,
+    "Check the map and the logs first (bayessim-mjx logs check): signs, units, times and exchanged columns. Do not "
+    f"train with the effects: they close less than half of the gap. {BELOW}.",
+)
 REMAINDER = Verdict(
     "Effects and a remainder",
     "The named effects explain most of the gap; more than the tolerance remains.",
@@ -109,8 +116,17 @@ def verdict_of(d: Diagnosis) -> Verdict:
     if d.verdict == "effects" and lacks(d):
         return replace(VERDICTS["effects"], advice=NOT_IN_MUJOCO)
     found = PARTLY if d.verdict == "unexplained" and d.effects and d.gap.beyond else VERDICTS[d.verdict]
+    found = LITTLE if little(d) else found
     looked = d.where or d.next_experiment  # the stages that a short diagnosis leaves out
     return found if looked else replace(found, advice=found.advice.replace(BELOW, NOT_BELOW))
+
+
+def little(d: Diagnosis) -> bool:
+    """Whether effects are named that close less than half of the gap, and so do not explain it."""
+    if d.verdict != "unexplained" or not d.effects:
+        return False
+    gap = of_rms(d.gap.calibrated, d.gap.with_effects)
+    return gap.closed < gap.left
 
 
 def lacks(d: Diagnosis) -> bool:
@@ -130,7 +146,7 @@ def command(d: Diagnosis, folder: str | Path) -> str:
         return ""
     task, out = not model.endswith((".xml", ".mjcf")), Path(folder)
     said = ["bayessim-mjx"]
-    if d.verdict == "insufficient_data":
+    if d.verdict == "insufficient_data" or little(d):
         said += ["logs", "check", data[0], *([] if task else ["--model", model])]
     elif d.next_experiment.get("file") and d.verdict in ("ambiguous", "unexplained"):
         again = [*data, str(out.with_name("new_logs")), "--out", str(out.with_name(f"{out.name}_2"))]

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from bayessim_mjx.diagnosis.phrases import advice, notes, parameters, residual
 from bayessim_mjx.diagnosis.phrases import effects as named
-from bayessim_mjx.diagnosis.phrases import notes, parameters, residual
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
 from bayessim_mjx.diagnosis.selection.numbers import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
@@ -127,8 +127,8 @@ def _head(d: Diagnosis) -> str:
         first = named.capital((head + SMALL * above).format(**fill))
         return " ".join([first + _acts(d), *far_off])
     if d.verdict == "unexplained":
-        gap = of_rms(far.calibrated, far.with_effects)
-        head = f"{PARTLY_HEAD} {REST}" if far.beyond else PART if gap.closed > gap.left else HEADS["unexplained"]
+        head = HEADS["unexplained"] if advice.little(d) else PARTLY_HEAD if far.beyond else PART
+        head += f" {REST}" if far.beyond else ""
         return head.format(named=named.lacking(d.effects), **fill) + _acts(d)
     several = {a["effect"]: a for a in d.answers if len(a["members"]) > 1}
     open_ = [named.answer(e, several[label]) for e in d.effects if (label := f"{e.name}@{e.where}") in several]
@@ -172,11 +172,12 @@ def _how_far(d: Diagnosis) -> list[str]:
     far, basis, out = d.gap, d.basis, []
     left = of_rms(far.calibrated, far.with_effects).left
     if d.effects:
-        nearest = d.verdict == "unexplained" and not far.beyond
+        little = advice.little(d)
+        nearest = d.verdict == "unexplained" and (little or not far.beyond)
         out += [NEAREST.replace("{nearest}", "; ".join(map(named.line, d.effects)))] if nearest else []
         out.append(FALLS)
         if d.verdict == "unexplained":
-            out += [LITTLE] if of_rms(far.calibrated, far.with_effects).closed < left else []
+            out += [LITTLE] if little else []
             remains = basis.get("remains") or 0.0
             out += [(ON_TOP if remains <= 1 else LARGER).replace("{remains}", percent(remains))] if remains > 0 else []
         out += [IMPERFECT] if far.beyond and d.verdict != "unexplained" and left > 0 else []

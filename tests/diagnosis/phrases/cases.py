@@ -131,6 +131,7 @@ def every():
         "little is closed": made(
             "unexplained", [GAIN], gap(with_effects=8.0), probability=chance, remains=0.4, flexible=NOTHING
         ),
+        "little is closed, far beyond": made("unexplained", [GAIN], dataclasses.replace(some, with_effects=8.0)),
         "beside joints that keep their speed": made("unexplained", [GAIN], gap(with_effects=6.0, coasting=5.0)),
         "known parameters": made("effects", [FRICTION], parameters=known, builds_up=3.0),
         "a heavier link": made("effects", [FRICTION], parameters=heavier, accuracy={"mass": {"low": 0.15}}),

@@ -202,6 +202,16 @@ def test_an_experiment_is_advised_only_where_there_is_one():
     assert "none was found here" in advice.verdict_of(none).advice
 
 
+def test_effects_that_close_less_than_half_lead_to_the_map_and_not_to_training():
+    """Of 99 above the noise 8 noise sd leave 63: the effects close 36 % of the squared gap."""
+    far = dataclasses.replace(cases.every()["partly"].gap, calibrated=10.0, with_effects=8.0)
+    found = dataclasses.replace(made("unexplained", [GAIN], far), about=ABOUT | {"model": "arm.xml"})
+    assert "map and the logs first" in advice.verdict_of(found).advice
+    assert "Train with effects.yaml" not in advice.verdict_of(found).advice
+    assert advice.command(found, "found") == "bayessim-mjx logs check 'my logs' --model arm.xml"
+    assert found.sentences[0].startswith("No effect of the library explains the gap")
+
+
 def test_effects_within_the_tolerance_that_explain_nothing_are_no_part_of_an_explanation():
     assert advice.verdict_of(made("unexplained", [GAIN])).badge == "Unexplained"
     assert advice.verdict_of(cases.every()["partly"]).badge == "Partly explained"
