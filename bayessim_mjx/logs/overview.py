@@ -50,6 +50,7 @@ class Overview:
         missing: channels that the logs need; refused: why they cannot be read. Both have to be mended.
         map_text: the map that was proposed, "" where there is one.
         logs: as a diagnosis reads them, where nothing has to be mended.
+        end: the last line, of how many logs are refused.
     """
 
     columns: list[tuple[str, ...]] = field(default_factory=list)
@@ -59,6 +60,7 @@ class Overview:
     refused: list[str] = field(default_factory=list)
     map_text: str = ""
     logs: list[Log] = field(default_factory=list)
+    end: str = ""
 
     @property
     def faults(self) -> list[str]:

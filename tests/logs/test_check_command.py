@@ -189,8 +189,13 @@ def moved(seconds: float = 4.0) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("change", "said"),
-    [([1, 1, 1, 1, 1], ""), ([1, -1, -1, 1, 1], "the opposite sign"), ([1, 1, 1, 40, 1], "unexplained by any model")],
-    ids=["right", "mirrored", "unit"],
+    [
+        ([1, 1, 1, 1, 1], ""),
+        ([1, -1, -1, 1, 1], "the opposite sign would"),
+        ([1, 1, 1, 1, -1], "the opposite sign of the position of elbow would"),
+        ([1, 1, 1, 40, 1], "unexplained by any model"),
+    ],
+    ids=["right", "mirrored", "encoder", "unit"],
 )
 def test_what_a_diagnosis_refuses_by_the_model_is_refused_here(
     tmp_path: Path, capsys: pytest.CaptureFixture, change: list[float], said: str
@@ -202,8 +207,9 @@ def test_what_a_diagnosis_refuses_by_the_model_is_refused_here(
     assert not said or ("refused: run.csv: effort unrelated" in out and said in out), out
 
 
-def test_a_log_that_a_diagnosis_leaves_out_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_log_that_a_diagnosis_leaves_out_is_the_last_word(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     logs_of(tmp_path, moved(), HEADER)
     folder = logs_of(tmp_path, moved() * np.array([1, -1, -1, 1, 1]), HEADER, "wrong.csv")
     code, out = check(capsys, folder, "--model", model_of(tmp_path))
-    assert code == 0 and "note: wrong.csv: refused: effort unrelated" in out and "nothing is missing" in out
+    assert code == 2 and "refused: wrong.csv: effort unrelated" in out and "nothing is missing" not in out
+    assert out.splitlines()[-1].startswith("1 of 2 logs refused: wrong.csv;")
