@@ -212,7 +212,7 @@ def _checked(args: argparse.Namespace) -> int:
 
 def _gated(args: argparse.Namespace, found: "Overview") -> None:
     """Add what the gate of a diagnosis says of the logs: refusals, each once with its logs, and notes."""
-    from bayessim_mjx.diagnosis.fitting import robot
+    from bayessim_mjx.diagnosis.fitting import cutting, robot
     from bayessim_mjx.diagnosis.logcheck import gate
     from bayessim_mjx.diagnosis.setup import control_period
 
@@ -220,7 +220,8 @@ def _gated(args: argparse.Namespace, found: "Overview") -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of the model, which a diagnosis says
             own = robot.of_file(args.model, None, args.drive, args.packages)
-        said = gate.check(found.logs, own.mj_model, control_period(own, found.logs))
+        period = control_period(own, found.logs)
+        said = gate.check(found.logs, own.mj_model, period)
     except UserError as error:
         found.refused.append(str(error))
         return
@@ -228,6 +229,8 @@ def _gated(args: argparse.Namespace, found: "Overview") -> None:
     if said.refused:
         shown, of = listed([*said.refused], most=MOST), count(len(said.reports), "log")
         found.end = f"{len(said.refused)} of {of} refused: {shown}; mend the map or the log, or take the file away"
+    elif lacking := cutting.too_few(said.usable, period):
+        found.refused.append(lacking)
     found.notes += [text for text in (*said.doubts, *said.findings) if text not in found.notes]
 
 

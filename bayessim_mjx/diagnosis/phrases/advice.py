@@ -72,6 +72,9 @@ ALIKE = Verdict(
     VERDICTS["ambiguous"].headline,
     "Randomise over all explanations, or log another motion: none was found here that separates them.",
 )
+LONGER = replace(
+    VERDICTS["insufficient_data"], advice="Record longer logs, as the first sentence says, and diagnose again."
+)
 NOT_IN_MUJOCO = (
     f"Train with the corrected simulator: effects.yaml (docs/own_robot.md shows its use in Python). {MODEL} lacks "
     "a part of it, which the warnings name."
@@ -111,6 +114,8 @@ def verdict_of(d: Diagnosis) -> Verdict:
         return REMAINDER
     if d.verdict == "ambiguous" and d.next_experiment.get("name", "none") == "none":
         return ALIKE if d.next_experiment else UNSOUGHT
+    if d.verdict == "insufficient_data" and not d.warnings:
+        return LONGER
     if d.verdict == "parameters" and stand_ins(d.parameters):
         return EITHER
     if d.verdict == "effects" and lacks(d):

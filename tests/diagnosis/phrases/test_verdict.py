@@ -191,6 +191,8 @@ def test_a_model_for_mujoco_that_lacks_an_effect_is_not_advised():
 def test_too_little_data_leads_to_a_check_of_the_logs():
     found = dataclasses.replace(made("no_gap"), verdict="insufficient_data", about=ABOUT | {"model": "arm.xml"})
     assert advice.command(found, "found") == "bayessim-mjx logs check 'my logs' --model arm.xml"
+    assert "warnings" not in advice.verdict_of(found).advice
+    assert "as the warnings say" in advice.verdict_of(dataclasses.replace(found, warnings=["a note"])).advice
 
 
 def test_an_experiment_is_advised_only_where_there_is_one():
