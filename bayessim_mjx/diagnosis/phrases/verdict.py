@@ -8,10 +8,10 @@ from typing import Any
 
 from bayessim_mjx.diagnosis.phrases import advice, notes, parameters, residual
 from bayessim_mjx.diagnosis.phrases import effects as named
-from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
+from bayessim_mjx.diagnosis.result import Diagnosis, Gap
 from bayessim_mjx.diagnosis.selection.numbers import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
-from bayessim_mjx.quantities import MOST, extent, finite, listed, percent
+from bayessim_mjx.quantities import MOST, count, extent, finite, listed, percent
 
 SHARES = ("predicted", "realised", "elsewhere")  # of `Gap.closed`; effects that widen the gap close none
 HEADS = {
@@ -60,6 +60,10 @@ BEHIND = (
     "The held-out score alone ranks it {rank} of {count}, {behind} nats behind the first{error}. The verdict goes by "
     "the probability."
 )
+FURTHER = (
+    "Ahead by the held-out score: {sets} with further effects. These close at most {more} more of the gap, less than "
+    "the relevant {share}, and so count as this one."
+)
 PAST = "The missing force depends on something else, such as the past of the motion."
 SPLITS = "To separate the explanations, run the next experiment: {name}."
 HIDDEN = (
@@ -103,7 +107,8 @@ def sentences(d: Diagnosis) -> list[str]:
         texts += [PAST] if basis.get("remains") and not residual.predicts(basis["flexible"]) else []
     if basis.get("efforts"):
         texts.append(f"By the logged efforts alone, {basis['efforts']}.")
-    texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
+    ends = [e for e in d.effects if any(v.bound not in ("", "off") for v in e.parameters.values())]
+    texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in ends]
     texts += parameters.remarks(d.parameters, said=d.verdict == "parameters")
     texts += [named.not_on_offer(basis["tried"])] if d.verdict == "unexplained" and basis.get("tried") else []
     return [text for text in [*texts, notes.not_tried(basis.get("not_tried"))] if text]
@@ -230,10 +235,24 @@ def _behind(d: Diagnosis) -> str:
     if rank in (None, 1) or not _probable(d):
         return ""
     first, own = d.candidates[0], d.candidates[rank - 1]
-    if first["score"] - own["score"] < math.log(ODDS.strong):
+    ahead = [c for c in d.candidates[: rank - 1] if c["score"] - own["score"] >= math.log(ODDS.strong)]
+    if not ahead:
         return ""
+    if all(counts_as_answer(d, c) for c in ahead):
+        ahead = [c for c in d.candidates[: rank - 1] if counts_as_answer(d, c)]
+        more = percent(max(0.0, *(c["gap_closed"] - own["gap_closed"] for c in ahead)))
+        return FURTHER.format(sets=count(len(ahead), "set"), more=more, share=percent(RELEVANCE.share))
     error = f" (standard error {first['se']:.0f})" if finite(first.get("se")) else ""
     return BEHIND.format(rank=rank, count=len(d.candidates), behind=f"{first['score'] - own['score']:.0f}", error=error)
+
+
+def counts_as_answer(d: Diagnosis, candidate: Mapping[str, Any]) -> bool:
+    """Whether a set holds the named effects and others that close an irrelevant share of the gap (docs/evidence.md)."""
+    named, own = {f"{e.name}@{e.where}" for e in d.effects}, d.candidates[(d.rank or 1) - 1]
+    if d.rank is None or not named < set(candidate.get("effects") or []):
+        return False
+    more = (candidate.get("gap_closed") or math.nan) - (own.get("gap_closed") or math.nan)
+    return bool(more < RELEVANCE.share)
 
 
 def coasting(far: Gap, named: bool) -> str:
@@ -243,10 +262,6 @@ def coasting(far: Gap, named: bool) -> str:
     closed = of_rms(far.coasting, far.with_effects).closed
     more = COASTS_CLOSED.format(closed=percent(max(closed, 0.0))) if named and finite(closed) else ""
     return COASTS.format(coasting=number(far.coasting), calibrated=number(far.calibrated), more=more)
-
-
-def _at_bound(effect: FoundEffect) -> bool:
-    return any(v.bound not in ("", "off") for v in effect.parameters.values())
 
 
 def stage(far: Gap, name: str) -> str:

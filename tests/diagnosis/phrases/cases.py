@@ -25,6 +25,8 @@ RANKED = [
     {"effects": [*labels], "score": score, "se": 151.0}
     for labels, score in ((("gain@torque",), 2162.0), (("coulomb_friction@hinge",), 2085.0), ((), 0.0))
 ]
+FURTHER = [RANKED[0] | {"effects": ["coulomb_friction@hinge", "gain@torque"], "gap_closed": 0.9815},
+           RANKED[1] | {"gap_closed": 0.98}, RANKED[2]]  # fmt: skip
 BASIS = {"window": 0.5, "remains": 0.0, "above_noise": True}
 
 
@@ -111,6 +113,7 @@ def every():
         "noise with a memory": made("noise", noise_memory=0.06),
         "one effect": made("effects", [FRICTION], probability=chance),
         "another set with the best score": made("effects", [FRICTION], probability=chance, candidates=RANKED),
+        "a larger set with the best score": made("effects", [FRICTION], probability=chance, candidates=FURTHER),
         "two effects": made("effects", [FRICTION, GAIN], hidden=["viscous_friction@hinge"]),
         "one law at two joints": made("effects", [FRICTION, dataclasses.replace(FRICTION, where="elbow")]),
         "one log": made("effects", [FRICTION], gap(closed=ALONE, in_sample=True)),

@@ -214,6 +214,16 @@ def test_effects_that_close_less_than_half_lead_to_the_map_and_not_to_training()
     assert found.sentences[0].startswith("No effect of the library explains the gap")
 
 
+def test_a_set_with_further_effects_that_close_nothing_is_no_other_answer():
+    """By the rule of relevance, .3 % of the squared gap: .15 % more counts as the answer, .9 % more does not."""
+    own = cases.every()["a larger set with the best score"]
+    assert [verdict.counts_as_answer(own, c) for c in own.candidates] == [True, False, False]
+    assert "1 set with further effects. These close at most 0.15 % more of the gap" in " ".join(own.sentences)
+    much = [own.candidates[0] | {"gap_closed": 0.989}, *own.candidates[1:]]
+    text = " ".join(verdict.sentences(dataclasses.replace(own, candidates=much)))
+    assert "further effects" not in text and "ranks it 2 of 3, 77 nats behind" in text
+
+
 def test_effects_within_the_tolerance_that_explain_nothing_are_no_part_of_an_explanation():
     assert advice.verdict_of(made("unexplained", [GAIN])).badge == "Unexplained"
     assert advice.verdict_of(cases.every()["partly"]).badge == "Partly explained"
