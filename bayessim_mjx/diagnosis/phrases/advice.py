@@ -208,15 +208,20 @@ def run_experiment(name: str, seconds: float) -> str:
 
 
 def sharpens(action: str, parameter: str, before: float, after: float) -> str:
-    """Return the gain in accuracy of a parameter, where no rival is left.
-
-    As a ratio: both are of noise alone, and so smaller than the standard deviation that the diagnosis reports.
-    """
+    """Return the gain in accuracy of a parameter, where no rival is left, as a ratio."""
     return f"{action}: it should divide the standard deviation of {parameter} by {before / after:.2g}"
 
 
-def sharpens_little(best: str, parameter: str, before: float, after: float) -> str:
-    """Say that no experiment helps; best: its name, with the parameter that it measures best."""
+def sharpens_little(best: str, parameter: str, before: float, after: float, allowed: float = 0.0) -> str:
+    """Say that no experiment helps.
+
+    Args:
+        best: name of the best one, with the parameter that it measures best.
+        allowed: share of the standard deviation that allows for other simulators.
+    """
+    if 2 * allowed**2 > 1:  # most of the variance
+        share = percent(allowed)
+        return f"no experiment sharpens {parameter}: {share} of its standard deviation allows for other simulators"
     left = percent(after / before)
     return (
         f"no experiment of the menu adds much; the best, {best}, leaves {left} of the standard deviation of {parameter}"

@@ -79,6 +79,7 @@ BENT = (
     "chance, even if the data sheet is half as inaccurate again as stated. Something else may be missing, or the data "
     "sheet is of another robot (--accuracy, --parameters)."
 )
+ALLOWED = "Standard deviations allow for other simulators, which no data reduce. By the logs alone: {each}."
 OF_SENSORS = "The residual has the covariance of sensor noise, {colour}."
 CHANCE = (
     "No candidate and no flexible force predicts the residual, {calibrated}, on held-out {held}. Possible causes: "
@@ -206,6 +207,17 @@ def _doubts(d: Diagnosis) -> list[str]:
     if d.basis.get("builds_up"):
         times, window = f"{d.basis['builds_up']:.2g}", f"{d.basis['window']:.2g} s"
         out.append(BUILDS_UP.format(times=times, window=window))
+    known_by = [
+        (named.titled(e.name, e.where), p.sd, math.sqrt(max(p.sd**2 - p.allowed**2, 0.0)), p.unit)
+        for e in d.effects
+        for p in [*e.parameters.values()][:1]
+        if finite(p.sd) and 2 * p.allowed**2 > p.sd**2
+    ]
+    scaled = [
+        (name, 1e3 * sd, 1e3 * own, "ms") if unit == "s" else (name, sd, own, unit) for name, sd, own, unit in known_by
+    ]
+    each = [f"{own:.2g} of the {f'{sd:.2g} {unit}'.rstrip()} of {name}" for name, sd, own, unit in scaled]
+    out += [ALLOWED.format(each=listed(each, most=3))] if each else []
     return out
 
 

@@ -42,6 +42,7 @@ def effect(name, where, closed=0.5, rivals=(), shared=None, **numbers):
 
 FRICTION = effect("coulomb_friction", "hinge", 0.66, level=(0.1497, 0.0087, "N m"))
 GAIN = effect("actuator_gain", "torque", 0.32, gain=(0.698, 0.036, ""))
+SHARP = effect("coulomb_friction", "hinge", 0.66, level=(0.12, 0.0013, "N m", "", 0.0012))
 UNSURE = effect("actuator_gain", "torque", 0.32, gain=(1.05, 0.55, ""))
 DELAY = effect(
     "actuator_delay", "torque", 0.98, [["actuator_lag@torque"], ["sensor_delay@hinge"]],
@@ -119,10 +120,7 @@ def every():
         "one log": made("effects", [FRICTION], gap(closed=ALONE, in_sample=True)),
         "a remainder": made("effects", [FRICTION], some),
         "much is left within the tolerance": made("ambiguous", [FRICTION, PAYLOAD], gap(with_effects=6.0)),
-        "an effect at its bound": made(
-            "effects",
-            [dataclasses.replace(END, sentence="Gap ends.")],
-        ),
+        "an effect at its bound": made("effects", [dataclasses.replace(END, sentence="Gap ends.")]),
         "a class with a number": made("ambiguous", [DELAY], experiment=run, probability=chance),
         "a class without a number": made("ambiguous", [FRICTION, PAYLOAD]),
         "a class that no motion separates": made("ambiguous", [FRICTION, PAYLOAD], experiment={"name": "none"}),
@@ -138,6 +136,7 @@ def every():
         "beside joints that keep their speed": made("unexplained", [GAIN], gap(with_effects=6.0, coasting=5.0)),
         "known parameters": made("effects", [FRICTION], parameters=known, builds_up=3.0),
         "a heavier link": made("effects", [FRICTION], parameters=heavier, accuracy={"mass": {"low": 0.15}}),
+        "known better than simulators agree": made("effects", [SHARP]),
         "one parameter": made("effects", [FRICTION], parameters=few, efforts="the motors follow"),
     }  # fmt: skip
 

@@ -224,6 +224,13 @@ def test_a_set_with_further_effects_that_close_nothing_is_no_other_answer():
     assert "further effects" not in text and "ranks it 2 of 3, 77 nats behind" in text
 
 
+def test_of_a_standard_deviation_the_part_of_the_logs_is_said_where_it_is_the_smaller_one():
+    """.0005 of .0013, as .0013^2 = .0012^2 + .0005^2."""
+    text = " ".join(cases.every()["known better than simulators agree"].sentences)
+    assert "By the logs alone: 0.0005 of the 0.0013 N m of Coulomb friction at hinge." in text
+    assert "By the logs alone" not in " ".join(cases.every()["one effect"].sentences)
+
+
 def test_effects_within_the_tolerance_that_explain_nothing_are_no_part_of_an_explanation():
     assert advice.verdict_of(made("unexplained", [GAIN])).badge == "Unexplained"
     assert advice.verdict_of(cases.every()["partly"]).badge == "Partly explained"
