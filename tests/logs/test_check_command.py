@@ -223,6 +223,40 @@ def test_logs_that_hold_too_few_windows_for_a_diagnosis_are_refused_with_numbers
     assert not said or out.splitlines()[-1].startswith(f"refused: {said}"), out
 
 
+def test_what_a_map_names_in_vain_is_said_as_a_diagnosis_says_it(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """A column that the file lacks, and an actuator that the model lacks; no channel is missing in the map."""
+    folder, model = logs_of(tmp_path, moved(), "t,ua,ub,qa,qb"), model_of(tmp_path)
+    text = "time: t\nctrl: {m_shoulder: ua, m_elbow: uc}\nqpos: {shoulder: qa, elbow: qb}\n"
+    (folder / "map.yaml").write_text(text)
+    code, out = check(capsys, folder, "--model", model)
+    assert code == 2 and "no column 'uc' (" in out and "ctrl.m_elbow" in out and "missing: " not in out, out
+    (folder / "map.yaml").write_text(text.replace("uc", "ub").replace("m_elbow", "m_ellbow"))
+    code, out = check(capsys, folder, "--model", model)
+    assert code == 2 and "ctrl.m_ellbow is no channel of the model; did you mean 'm_elbow'?" in out, out
+    assert "missing: " not in out
+
+
+def test_a_stray_file_is_named_beside_the_others_columns(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = logs_of(tmp_path, moved(), HEADER)
+    (folder / "a.csv").write_text("hello\nthis is a note\n")
+    (folder / "map.yaml").write_text("files: '*.csv'\ntime: time\nctrl: {m_shoulder: ctrl:m_shoulder}\n")
+    code, out = check(capsys, folder, "--model", model_of(tmp_path))
+    assert (
+        code == 2
+        and "\nrun.csv:\n" in out
+        and "\na.csv:\n" in out
+        and "qpos:elbow" in out
+        and "a.csv: no column" in out
+    ), out
+
+
+def test_the_mend_of_degrees_names_the_files_column(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = logs_of(tmp_path, rows(400) * np.array([1, 1, 1, 1, 300]), "t,ua,ub,qa,qb")
+    (folder / "map.yaml").write_text("time: t\nctrl: {m_shoulder: ua, m_elbow: ub}\nqpos: {shoulder: qa, elbow: qb}\n")
+    code, out = check(capsys, folder, "--model", model_of(tmp_path))
+    assert code == 2 and "elbow: {column: 'qb', unit: deg}" in out, out
+
+
 def test_a_log_that_a_diagnosis_leaves_out_is_the_last_word(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     logs_of(tmp_path, moved(), HEADER)
     folder = logs_of(tmp_path, moved() * np.array([1, -1, -1, 1, 1]), HEADER, "wrong.csv")
