@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from bayessim_mjx import cli
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.quantities import MOST, count, listed
 
 if TYPE_CHECKING:
     from bayessim_mjx.logs.importers.ros import Choice
@@ -199,6 +200,8 @@ def _checked(args: argparse.Namespace) -> int:
         _write_map(path, found.map_text)
     for fault in found.faults:
         print(fault)
+    if found.end:
+        print(found.end)
     if not found.faults:
         own = cli.urdf_words(args.drive, args.packages)
         print(
@@ -208,8 +211,8 @@ def _checked(args: argparse.Namespace) -> int:
 
 
 def _gated(args: argparse.Namespace, found: "Overview") -> None:
-    """Add what the gate of a diagnosis says of the logs: refused where no log passes, else notes."""
-    from bayessim_mjx.diagnosis.fitting import robot
+    """Add what the gate of a diagnosis says of the logs: refusals, each once with its logs, and notes."""
+    from bayessim_mjx.diagnosis.fitting import cutting, robot
     from bayessim_mjx.diagnosis.logcheck import gate
     from bayessim_mjx.diagnosis.setup import control_period
 
@@ -217,14 +220,18 @@ def _gated(args: argparse.Namespace, found: "Overview") -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of the model, which a diagnosis says
             own = robot.of_file(args.model, None, args.drive, args.packages)
-        said = gate.check(found.logs, own.mj_model, control_period(own, found.logs))
+        period = control_period(own, found.logs)
+        said = gate.check(found.logs, own.mj_model, period)
     except UserError as error:
         found.refused.append(str(error))
         return
-    if not said.usable:
-        found.refused += [f"{name}: {reason}" for name, reason in said.refused.items()]
-        return
-    found.notes += [text for text in (*said.warnings, *said.findings) if text not in found.notes]
+    found.refused += [f"{listed(names, most=MOST)}: {reason}" for reason, names in said.reasons.items()]
+    if said.refused:
+        shown, of = listed([*said.refused], most=MOST), count(len(said.reports), "log")
+        found.end = f"{len(said.refused)} of {of} refused: {shown}; mend the map or the log, or take the file away"
+    elif lacking := cutting.too_few(said.usable, period):
+        found.refused.append(lacking)
+    found.notes += [text for text in (*said.doubts, *said.findings) if text not in found.notes]
 
 
 def _shown(args: argparse.Namespace) -> int:
@@ -232,13 +239,15 @@ def _shown(args: argparse.Namespace) -> int:
     for flag, path in (("--out", args.out), ("--mcap", args.mcap)):
         if path:
             cli.writable(Path(path).parent, flag)
-    from bayessim_mjx.logs import mcap_file, views
+    from bayessim_mjx.logs import excited, mcap_file, views
     from bayessim_mjx.report import log_page
 
     if args.mcap:
         mcap_file.writer()
     shown = views.view(Path(args.path), _model(args), args.map)
-    for fault in shown.overview.faults:
+    crossed = excited.swapped(shown.sheets, shown.pairs)
+    shown.overview.notes += crossed
+    for fault in (*shown.overview.faults, *crossed):
         print(fault)
     print(f"page: {log_page.write(shown, Path(args.out), Path(args.path).resolve().name)}")
     if args.mcap:

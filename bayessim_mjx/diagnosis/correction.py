@@ -31,12 +31,14 @@ class Estimate:
         bound: "" inside the range. An effect's range doubles while held-out evidence gains from it, up to a hundred
             times. "at least", "at most": the estimate ends where nothing larger or smaller was tried. "end": physics
             ends there, or a wider range explains no more. "off": the number has no part in the effect.
+        allowed: the part of `sd` that allows for other simulators, whatever the data (`numbers.Priors`).
     """
 
     mean: float
     sd: float
     unit: str = ""
     bound: str = ""
+    allowed: float = 0.0
 
     def __repr__(self) -> str:
         """`0.1191 +- 0.0016 N m`: rounded by the standard deviation, also inside of `FoundEffect.parameters`."""

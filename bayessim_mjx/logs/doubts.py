@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -48,6 +48,7 @@ def check_units(
             or its target in another unit only; names the keys of the map.
     """
     sources = {name: source for name, source, _ in log_map.channels()}
+    of = {name: source.name(table, name) for name, source in sources.items() if source.value is None}
     kinds = dict(zip(channels.joints, channels.kinds, strict=True))
     followed = dict(servos(model, through, declared))
     for name, source in sources.items():
@@ -59,15 +60,15 @@ def check_units(
     for j, joint in enumerate(channels.joints):
         kind, name = channels.kinds[j], f"qpos:{joint}"
         if kind in ("hinge", "slide") and model.jnt_limited[j] and name in unstated:
-            _by_range(table, name, columns[name], kind, *map(float, model.jnt_range[j]))
+            _by_range(table, name, columns[name], kind, [*map(float, model.jnt_range[j])], of)
         elif kind == "hinge" and name in unstated:
-            _many_turns(table, name, columns[name])
+            _many_turns(table, name, columns[name], of)
         if kind in ("hinge", "slide") and name in unstated:
-            _by_counting(table, name, columns[name], kind)
+            _by_counting(table, name, columns[name], kind, of)
     for i, j in followed.items():
         pair = f"qpos:{channels.joints[j]}", f"ctrl:{channels.actuators[i]}"
         if unstated & set(pair):
-            _by_target(table, *pair, columns)
+            _by_target(table, *pair, columns, of)
 
 
 def _key(name: str, column: object, unit: str) -> str:
@@ -108,8 +109,9 @@ def _by_name(
     raise UserError(f"{text}; allowed: {_key(name, column, str(unit))} in the map, or {keep}")
 
 
-def _by_range(table: Table, name: str, x: Array, kind: str, low: float, high: float) -> None:
+def _by_range(table: Table, name: str, x: Array, kind: str, limits: Sequence[float], of: Mapping[str, str]) -> None:
     """Values beyond the joint's range that another unit would bring into it."""
+    low, high = limits
     outside = np.abs(x) > max(FAR * max(abs(low), abs(high)), TURN if kind == "hinge" else 0.0)
     if np.mean(outside) < 0.02:
         return
@@ -120,7 +122,7 @@ def _by_range(table: Table, name: str, x: Array, kind: str, low: float, high: fl
     if not fits:
         return
     at = f"{table.path}: column {name!r}, {table.where(row)}: {x[row]:.6g} is far outside the model's range"
-    keys = " or ".join(_key(name, name, unit) for unit in fits)
+    keys = " or ".join(_key(name, of.get(name, name), unit) for unit in fits)
     own = "rad" if kind == "hinge" else "m"
     raise UserError(
         f"{at} [{low:g}, {high:g}], and values from {x.min():.6g} to {x.max():.6g} would fit as {' or '.join(fits)}; "
@@ -128,20 +130,20 @@ def _by_range(table: Table, name: str, x: Array, kind: str, low: float, high: fl
     )
 
 
-def _many_turns(table: Table, name: str, x: Array) -> None:
+def _many_turns(table: Table, name: str, x: Array, of: Mapping[str, str]) -> None:
     """Two turns one way and two turns back, of a joint without a range: rare in rad, usual in degrees."""
     up, down = np.max(x - np.minimum.accumulate(x)), np.max(np.maximum.accumulate(x) - x)
     if min(up, down) > 2.0 * TURN and np.abs(np.diff(x)).max() < np.pi:
         text = f"{table.path}: column {name!r} goes to and fro by {np.ptp(x) / TURN:.3g} turns in rad"
-        warnings.warn(f"{text}; degrees would need {_key(name, name, 'deg')} in a map", stacklevel=5)
+        warnings.warn(f"{text}; degrees would need {_key(name, of.get(name, name), 'deg')} in a map", stacklevel=5)
 
 
-def _by_counting(table: Table, name: str, x: Array, kind: str) -> None:
+def _by_counting(table: Table, name: str, x: Array, kind: str, of: Mapping[str, str]) -> None:
     """Refuse a joint that moves from whole number to whole number: its unit is neither rad nor m."""
     if not _whole(x) or values_shown(x) < LEVELS:
         return
     own, others = ("rad", (units.COUNTS, "deg")) if kind == "hinge" else ("m", ("mm", units.PERCENT))
-    keys = " or ".join(_key(name, name, unit) for unit in others)
+    keys = " or ".join(_key(name, of.get(name, name), unit) for unit in others)
     text = f"{table.path}: column {name!r} holds whole numbers alone, from {x.min():g} to {x.max():g} {own}"
     raise UserError(f"{text}; state its unit in a map: {keys}, or `unit: {own}` if they are in {own} all the same")
 
@@ -171,7 +173,7 @@ def _fitting(x: Array, kind: str, low: float, high: float) -> list[str]:
     return found
 
 
-def _by_target(table: Table, reading: str, target: str, columns: Mapping[str, Array]) -> None:
+def _by_target(table: Table, reading: str, target: str, columns: Mapping[str, Array], of: Mapping[str, str]) -> None:
     """Find a joint that follows its target with the amplitude of another unit, of a gear, or mirrored."""
     q, c = columns[reading], columns[target]
     if not (np.ptp(q) > 0 and np.ptp(c) > 0):
@@ -180,7 +182,7 @@ def _by_target(table: Table, reading: str, target: str, columns: Mapping[str, Ar
     if max(alike, unwrapped) < -ALIKE:
         stream, _, own = reading.partition(":")
         text = f"{table.path}: {reading!r} goes against {target!r} (correlation {alike:.3f}), as if it were mirrored"
-        key = f"`{stream}: {{{own}: {{column: {reading!r}, sign: -1}}}}`"
+        key = f"`{stream}: {{{own}: {{column: {of.get(reading, reading)!r}, sign: -1}}}}`"
         raise UserError(f"{text}; state {key} in a map, or `unit: rad` of both if they are right")
     if alike < ALIKE:
         return
@@ -189,7 +191,7 @@ def _by_target(table: Table, reading: str, target: str, columns: Mapping[str, Ar
     for unit, scale in units.ANGLES.items():
         for name, factor in ((reading, ratio * scale), (target, scale / ratio)):
             if unit != "rad" and 1.0 / RATIO < factor < RATIO:
-                text = f"{text}: {name!r} may be in {unit}; state {_key(name, name, unit)} in a map"
+                text = f"{text}: {name!r} may be in {unit}; state {_key(name, of.get(name, name), unit)} in a map"
                 raise UserError(f"{text}, or `unit: rad` if not")
     if not 1.0 / FAR < ratio < FAR:
         warnings.warn(f"{text}; `scale` of one of them in a map takes out a gear or another unit", stacklevel=4)

@@ -26,7 +26,7 @@ from bayessim_mjx.logs.mapping import LogMap, Source
 from bayessim_mjx.logs.names import drives
 from bayessim_mjx.logs.pieces import MAX_GAP, SHORT_GAP
 from bayessim_mjx.logs.proposal import Proposal, native, propose
-from bayessim_mjx.logs.read import read_logs, table_of
+from bayessim_mjx.logs.read import check_map, read_logs, table_of
 from bayessim_mjx.logs.table import Table
 from bayessim_mjx.logs.transport import described
 from bayessim_mjx.logs.vendors import hinges
@@ -44,12 +44,13 @@ class Overview:
     """The output of `bayessim-mjx logs check`.
 
     Attributes:
-        columns: rows (column, channel, unit, values, note) of the first file.
+        columns: rows (column, channel, unit, values, note) of the first file, and of others with other columns.
         files: rows (file, rows, seconds, rate, jitter, gaps) of each file.
         notes: warnings and questions.
         missing: channels that the logs need; refused: why they cannot be read. Both have to be mended.
         map_text: the map that was proposed, "" where there is one.
         logs: as a diagnosis reads them, where nothing has to be mended.
+        end: the last line, of how many logs are refused. layouts: the different columns of the files.
     """
 
     columns: list[tuple[str, ...]] = field(default_factory=list)
@@ -59,6 +60,8 @@ class Overview:
     refused: list[str] = field(default_factory=list)
     map_text: str = ""
     logs: list[Log] = field(default_factory=list)
+    end: str = ""
+    layouts: list[tuple[str, ...]] = field(default_factory=list)
 
     @property
     def faults(self) -> list[str]:
@@ -82,8 +85,15 @@ def overview(path: Path, model: mujoco.MjModel | None, map_file: str | Path | No
     files = _files(path, log_map)
     if log_map is None:
         log_map = _proposed(out, files, model)
-    for k, file in enumerate(files):
-        _one(out, file, log_map, model, first=k == 0)
+    if model is not None and log_map.names_channels:
+        try:
+            check_map(log_map, Channels.of(model))
+        except UserError as error:
+            out.refused.append(str(error))
+    for file in files:
+        _one(out, file, log_map, model)
+    if len(out.layouts) > 1:
+        out.columns.insert(0, (f"{files[0].name}:", "", "", "", ""))
     if model is not None and not out.faults:
         _read(out, files, log_map, model)
     if model is None:
@@ -141,19 +151,23 @@ def _proposed(out: Overview, files: Sequence[Path], model: mujoco.MjModel | None
     return LogMap.read(content)
 
 
-def _one(out: Overview, file: Path, log_map: LogMap, model: mujoco.MjModel | None, first: bool) -> None:
+def _one(out: Overview, file: Path, log_map: LogMap, model: mujoco.MjModel | None) -> None:
     try:
         table = table_of(file, log_map)
     except UserError as error:
         if str(error) not in out.refused:
             out.refused.append(str(error))
         return
-    sources = _sources(table, log_map)
+    sources, absent = _sources(table, log_map)
+    out.refused += [text for text in absent if text not in out.refused]
     with warnings.catch_warnings(record=True) as said:  # of stamps in another unit
         warnings.simplefilter("always")
         out.notes += described(table, sources)
     out.notes += [str(w.message) for w in said]
-    if first:
+    layout = tuple(table.columns)
+    if layout not in out.layouts:
+        out.layouts.append(layout)
+        out.columns += [(f"{file.name}:", "", "", "", "")] if len(out.layouts) > 1 else []
         used = {str(source.column): name for name, source in sources.items()}
         own = {"time": "s"} | (units_of(model) if model is not None else {})  # of columns that are taken as they are
         out.columns += [_column(table, column, used, sources, log_map, own) for column in table.columns]
@@ -168,7 +182,7 @@ def _one(out: Overview, file: Path, log_map: LogMap, model: mujoco.MjModel | Non
         out.files.append((file.name, str(table.rows), "-", "-", "-", "-"))
         out.refused.append(str(error))
         return
-    if model is not None and file.suffix != ".npz":
+    if model is not None and file.suffix != ".npz" and not out.refused:
         have = [*sources, *(["time"] if time is not None else [])]
         lost = [name for name in needed_columns(have, Channels.of(model)) if name not in have]
         _missing(out, file, lost, Channels.of(model))
@@ -191,8 +205,11 @@ def _missing(out: Overview, file: Path, lost: Sequence[str], channels: Channels)
         out.missing.append(line)
 
 
-def _sources(table: Table, log_map: LogMap) -> Mapping[str, Source]:
-    """Where each channel comes from, columns by name; where the map names none, columns are named as channels."""
+def _sources(table: Table, log_map: LogMap) -> tuple[Mapping[str, Source], list[str]]:
+    """Where each channel comes from, columns by name, and what the map names in vain.
+
+    Where the map names no channel, columns are named as channels.
+    """
     if log_map.names_channels:
         every = {name: source for name, source, _ in log_map.channels()}
     else:
@@ -200,13 +217,16 @@ def _sources(table: Table, log_map: LogMap) -> Mapping[str, Source]:
     if log_map.rate is None and (log_map.time != LogMap.time or "time" in table.columns):
         every["time"] = log_map.time
     named = {}
+    where, absent = {name: text for name, _, text in log_map.channels()}, []
     for name, source in every.items():
         try:
-            column = None if source.value is not None else source.name(table, f"{log_map.path}: {name}")
-        except UserError:
+            at = where.get(name, f"{log_map.path}: {name}")
+            column = None if source.value is not None else source.name(table, at)
+        except UserError as error:
+            absent.append(str(error))
             continue
         named[name] = dataclasses.replace(source, column=column)
-    return named
+    return named, absent
 
 
 def _column(

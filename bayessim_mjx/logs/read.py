@@ -54,7 +54,7 @@ def read_logs(
     log_map = chosen if chosen is None or isinstance(chosen, LogMap) else LogMap.read(chosen)
     channels = Channels.of(mj_model)
     if log_map is not None:
-        _check_map(log_map, channels)
+        check_map(log_map, channels)
     files = distinct(files_of(paths, log_map))
     logs = [log for path in files for log in _read_one(path, mj_model, channels, log_map, partial)]
     _check_repeats(logs)
@@ -137,7 +137,12 @@ def _with_numbers(table: Table, columns: dict[str, Array]) -> dict[str, Array]:
     return {name: column for name, column in columns.items() if name not in empty}
 
 
-def _check_map(log_map: LogMap, channels: Channels) -> None:
+def check_map(log_map: LogMap, channels: Channels) -> None:
+    """Refuse names in a map that the model lacks.
+
+    Raises:
+        UserError: no such joint or actuator.
+    """
     for stream, allowed in (("ctrl", channels.actuators), ("qpos", channels.qpos), ("qvel", channels.qvel)):
         for name in getattr(log_map, stream):
             if name not in allowed:

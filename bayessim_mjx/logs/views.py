@@ -74,7 +74,7 @@ def view(path: Path, model: mujoco.MjModel | None, map_file: str | None = None) 
     """
     out = View(overview(path, model, map_file))
     if model is not None and not out.overview.faults:
-        out.sheets = [_sheet(log) for log in out.overview.logs]
+        out.sheets = [sheet_of(log) for log in out.overview.logs]
         out.units = units_of(model)
     else:
         own = map_file or map_of_folder(path)
@@ -92,7 +92,8 @@ def _proposed(found: Overview) -> LogMap:
     return LogMap.read(yaml.safe_load(found.map_text) or {}) if found.map_text else LogMap()
 
 
-def _sheet(log: Log) -> Sheet:
+def sheet_of(log: Log) -> Sheet:
+    """Return the channels of a log that were measured."""
     names = log.channels
     every = {f"ctrl:{n}": c for n, c in zip(names.actuators, log.ctrl.T, strict=True)}
     every |= {f"qpos:{n}": c for n, c in zip(names.qpos, log.qpos.T, strict=True)}
@@ -240,49 +241,6 @@ def coverage(sheets: Sequence[Sheet], joint: str, limits: tuple[float, float] | 
     share = None if limits is None or limits[1] <= limits[0] else float(np.ptp(q) / (limits[1] - limits[0]))
     rest = float(np.mean(np.abs(w) <= REST * fastest)) if fastest else 1.0
     return Coverage(columns, rows, counts.astype(np.int64), float(q.min()), float(q.max()), fastest, share, rest, turns)
-
-
-@dataclass(frozen=True)
-class Excitation:
-    """What commands move: coherence of each command with each joint's velocity.
-
-    Attributes:
-        commands, joints: names. coherence: [commands, joints] mean over frequencies, weighted by the command's power; 1
-            where the joint follows this command alone by a linear law; NaN where the logs are too short.
-    """
-
-    commands: tuple[str, ...]
-    joints: tuple[str, ...]
-    coherence: Array
-
-
-def excitation(sheets: Sequence[Sheet]) -> Excitation | None:
-    """Compute what excites what over all logs; None without commands or motion."""
-    commands = tuple(dict.fromkeys(n for s in sheets for n in s.names("ctrl")))
-    moved = tuple(joint for joint in joints(sheets) if any(velocity(s, joint) is not None for s in sheets))
-    if not commands or not moved:
-        return None
-    return Excitation(commands, moved, np.array([[_coherent(sheets, f"ctrl:{c}", j) for j in moved] for c in commands]))
-
-
-def _coherent(sheets: Sequence[Sheet], command: str, joint: str) -> float:
-    """Coherence of a command with a joint's velocity: spectra are summed over the logs before they are divided."""
-    length = min([SEGMENT, *(max(len(s.time) // 4, LEAST) for s in sheets)])
-    power = np.zeros((3, length // 2 + 1), complex)
-    for sheet in sheets:
-        u, w = sheet.channels.get(command), velocity(sheet, joint)
-        inside, outside = (None if x is None else even(sheet, x) for x in (u, w))
-        if inside is None or outside is None or min(len(inside[0]), len(outside[0])) < 2 * length:
-            continue
-        rows = min(len(inside[0]), len(outside[0]))
-        x, y, rate = inside[0][:rows], outside[0][:rows], 1 / inside[1]
-        for k, (a, b) in enumerate(((x, x), (y, y), (x, y))):
-            power[k] += rows * signal.csd(a, b, rate, nperseg=length)[1]
-    driven, moving = power[0].real[1:], power[1].real[1:]
-    if driven.sum() <= 0 or moving.sum() <= 0:
-        return float("nan")
-    share = np.abs(power[2][1:]) ** 2 / np.maximum(driven * moving, 1e-300)
-    return float(np.sum(np.minimum(share, 1.0) * driven) / driven.sum())
 
 
 def thinned(time: Array, values: Array, most: int) -> tuple[Array, Array]:

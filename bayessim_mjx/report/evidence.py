@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from bayessim_mjx.diagnosis.phrases.effects import label_title
+from bayessim_mjx.diagnosis.phrases.residual import beside_effects
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.diagnosis.statistics import Z90
 from bayessim_mjx.quantities import finite, unit
@@ -111,6 +112,7 @@ def flexible(d: Diagnosis) -> dict[str, Any]:
         "rows": [{"name": n, "value": number(v)} for n, v in known],
         "seeds": f"{number(min(seeds))} – {number(max(seeds))} over {len(seeds)} seeds" if len(seeds) > 1 else "",
         "where": found.get("where") or [],
+        "beside": beside_effects(d),
         "figure": rival_figures.importance(depends) if depends else None,
     }
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from bayessim_mjx.logs.channel_units import RATES
-from bayessim_mjx.logs.views import Coverage, Excitation, Sheet, spectrum, thinned, velocity
+from bayessim_mjx.logs.excited import Excitation
+from bayessim_mjx.logs.views import Coverage, Sheet, spectrum, thinned, velocity
 from bayessim_mjx.monitor.style import BLUE
 from bayessim_mjx.report.look import (
     COLUMN,

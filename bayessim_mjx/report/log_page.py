@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from bayessim_mjx.logs import views
+from bayessim_mjx.logs import excited, views
 from bayessim_mjx.logs.views import Sheet, View
 from bayessim_mjx.quantities import compact, count, duration, percent
 from bayessim_mjx.report import log_figures
@@ -40,7 +40,7 @@ def render(shown: View, source: str) -> str:
     from plotly.offline import get_plotlyjs
 
     joints = views.joints(shown.sheets)
-    found = views.excitation(shown.sheets)
+    found = excited.excitation(shown.sheets)
     return environment().get_template(TEMPLATE).render(
         plotly=Markup(get_plotlyjs()),
         width=WIDTH,

@@ -8,6 +8,7 @@ from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
 from bayessim_mjx.diagnosis.phrases.size import below_tiles, no_help, with_effects
+from bayessim_mjx.diagnosis.phrases.verdict import counts_as_answer
 from bayessim_mjx.diagnosis.phrases.verdict import number as noise_sd
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.diagnosis.statistics import of_one
@@ -228,6 +229,7 @@ def candidates(d: Diagnosis) -> dict[str, Any]:
                 "score": number(score),
                 "se": number(se) if se else "",
                 "chosen": k == answer,
+                "same": counts_as_answer(d, c),
                 "closed": closure(c.get("gap_closed")),
                 "absorbed": percent(c.get("absorbed")),
                 "values": "; ".join(own_number(n, v, hinged) for n, v in _own(c).items() if n not in d.parameters),

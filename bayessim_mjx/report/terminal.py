@@ -8,6 +8,7 @@ from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
 from bayessim_mjx.diagnosis.phrases.size import gap_line
+from bayessim_mjx.diagnosis.phrases.verdict import counts_as_answer
 from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect
 from bayessim_mjx.monitor.console import Console
 from bayessim_mjx.monitor.tables import TIE
@@ -124,6 +125,6 @@ def _candidates(d: Diagnosis) -> Table:
     for k, c in enumerate(d.candidates, 1):
         if k <= BEST or k == answer:
             se = number(c.get("se")) if finite(c.get("se")) else MISSING
-            mark = ", the verdict" if k == answer else ""
+            mark = ", the verdict" if k == answer else ", counts as the verdict" if counts_as_answer(d, c) else ""
             rows.append([f"{k} {candidate_title(c)}{mark}", number(c.get("score")), se, closure(c.get("gap_closed"))])
     return ["candidates", "held-out score (nats)", "standard error", "gap closed by the set"], rows, (0,)

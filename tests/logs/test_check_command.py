@@ -32,7 +32,7 @@ def logs_of(tmp_path: Path, table: np.ndarray, header: str, name: str = "run.csv
 def test_joints_names_give_a_map_and_missing_commands_are_said_at_once(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    folder = logs_of(tmp_path, rows()[:, [0, 3, 4]], "t,shoulder,elbow")
+    folder = logs_of(tmp_path, rows(400)[:, [0, 3, 4]], "t,shoulder,elbow")
     code, out = check(capsys, folder, "--model", model_of(tmp_path))
     assert code == 2 and "qpos:shoulder" in out and "100 Hz" in out
     assert out.splitlines()[-1].startswith("missing: commands: ctrl:m_shoulder, ctrl:m_elbow")
@@ -50,7 +50,7 @@ def test_units_that_are_taken_as_the_models_are_shown_and_a_refusal_is_no_missin
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     names = "time,ctrl:m_shoulder,ctrl:m_elbow,qpos:shoulder,qpos:elbow"
-    folder, model = logs_of(tmp_path, rows() * np.array([1, 1, 1, 300, 300]), names), model_of(tmp_path)
+    folder, model = logs_of(tmp_path, rows(400) * np.array([1, 1, 1, 300, 300]), names), model_of(tmp_path)
     code, out = check(capsys, folder, "--model", model)
     assert code == 2 and out.splitlines()[-1].startswith("refused: ") and "missing" not in out
     units = {row[1]: row[2] for row in (line.split() for line in out.splitlines()) if len(row) > 2}
@@ -61,7 +61,7 @@ def test_units_that_are_taken_as_the_models_are_shown_and_a_refusal_is_no_missin
 
 
 def test_a_spreadsheet_becomes_a_log_by_the_map_that_is_proposed(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    table = rows() * np.array([1000, 1, 1, 180 / np.pi, 180 / np.pi])
+    table = moved() * np.array([1000, 1, 1, 180 / np.pi, 180 / np.pi])
     (tmp_path / "logs").mkdir()
     names = "t [ms];ShoulderTorqueCommand;elbow_cmd;shoulder pos [\u00b0];elbow_actual_deg;note"
     lines = [";".join(f"{x:.6f}".replace(".", ",") for x in row) + ";ok" for row in table]
@@ -70,12 +70,12 @@ def test_a_spreadsheet_becomes_a_log_by_the_map_that_is_proposed(tmp_path: Path,
     assert code == 0, out
     assert "unused: text" in out and "nothing is missing" in out and "unit" in out
     (log,) = read_logs(tmp_path / "logs", MODEL)
-    np.testing.assert_allclose(log.time, rows()[:, 0], atol=1e-9)
-    np.testing.assert_allclose(np.c_[log.ctrl, log.qpos], rows()[:, 1:], atol=1e-6)
+    np.testing.assert_allclose(log.time, moved()[:, 0], atol=1e-9)
+    np.testing.assert_allclose(np.c_[log.ctrl, log.qpos], moved()[:, 1:], atol=1e-6)
 
 
 def test_logs_of_the_librarys_own_form_need_no_map(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    folder = logs_of(tmp_path, np.delete(rows(100), range(50, 70), axis=0), HEADER)
+    folder = logs_of(tmp_path, np.delete(moved(8.0), range(390, 410), axis=0), HEADER)
     before = read_some(folder)
     code, out = check(capsys, folder, "--model", model_of(tmp_path))
     assert code == 0 and "1, longest 0.21 s" in out and "cut into 2" in out
@@ -88,7 +88,7 @@ def read_some(folder: Path) -> list[float]:
 
 
 def test_a_folder_that_is_read_only_gets_no_map(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    folder = logs_of(tmp_path, rows()[:, [0, 3, 4]], "t,shoulder,elbow")
+    folder = logs_of(tmp_path, rows(400)[:, [0, 3, 4]], "t,shoulder,elbow")
     folder.chmod(0o555)
     try:
         _, out = check(capsys, folder, "--model", model_of(tmp_path))
@@ -102,7 +102,7 @@ def test_what_cannot_be_checked_says_the_way_on(tmp_path: Path, capsys: pytest.C
     assert "no log; it holds nothing" in error(capsys, "check", tmp_path)
     (tmp_path / "run.mcap").touch()
     assert "logs from-mcap" in error(capsys, "check", tmp_path)
-    folder = logs_of(tmp_path, rows(), "t,ua,ub,qa,qb")
+    folder = logs_of(tmp_path, rows(400), "t,ua,ub,qa,qb")
     code, out = check(capsys, folder)
     assert code == 2 and "missing: --model FILE" in out and "100 Hz" in out
     (folder / "map.yaml").unlink()
@@ -150,7 +150,7 @@ def test_stamps_in_two_columns_and_names_in_columns_of_their_own_are_understood(
     head = f"header.stamp.secs,header.stamp.nsecs,{names},Soll shoulder,u_elbow"
     lines = [
         f"{1772619302 + i // 100},{i % 100 * 10**7},elbow,shoulder,{r[4]:.6f},{r[3]:.6f},{r[1]:.6f},{r[2]:.6f}"
-        for i, r in enumerate(rows())
+        for i, r in enumerate(moved())
     ]
     folder = tmp_path / "logs"
     folder.mkdir()
@@ -158,7 +158,7 @@ def test_stamps_in_two_columns_and_names_in_columns_of_their_own_are_understood(
     code, out = check(capsys, folder, "--model", model_of(tmp_path))
     assert code == 0, out
     (log,) = read_logs(folder, MODEL)
-    np.testing.assert_allclose(np.c_[log.time - log.time[0], log.ctrl, log.qpos], rows(), atol=1e-6)
+    np.testing.assert_allclose(np.c_[log.time - log.time[0], log.ctrl, log.qpos], moved(), atol=1e-6)
     (folder / "map.yaml").unlink()
     lines[7] = lines[7].replace("elbow,shoulder", "shoulder,elbow")  # another publisher
     (folder / "run.csv").write_text("\n".join([head, *lines]))
@@ -189,8 +189,13 @@ def moved(seconds: float = 4.0) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("change", "said"),
-    [([1, 1, 1, 1, 1], ""), ([1, -1, -1, 1, 1], "the opposite sign"), ([1, 1, 1, 40, 1], "unexplained by any model")],
-    ids=["right", "mirrored", "unit"],
+    [
+        ([1, 1, 1, 1, 1], ""),
+        ([1, -1, -1, 1, 1], "the opposite sign would"),
+        ([1, 1, 1, 1, -1], "the opposite sign of the position of elbow would"),
+        ([1, 1, 1, 40, 1], "unexplained by any model"),
+    ],
+    ids=["right", "mirrored", "encoder", "unit"],
 )
 def test_what_a_diagnosis_refuses_by_the_model_is_refused_here(
     tmp_path: Path, capsys: pytest.CaptureFixture, change: list[float], said: str
@@ -202,8 +207,59 @@ def test_what_a_diagnosis_refuses_by_the_model_is_refused_here(
     assert not said or ("refused: run.csv: effort unrelated" in out and said in out), out
 
 
-def test_a_log_that_a_diagnosis_leaves_out_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        (0.4, "the longest log has 0.39 s; diagnose needs windows of 0.5 s"),
+        (2.4, "the logs hold 4 windows of 0.5 s; diagnose needs 6, or 3 s of motion"),
+        (3.2, ""),
+    ],
+)
+def test_logs_that_hold_too_few_windows_for_a_diagnosis_are_refused_with_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture, seconds: float, said: str
+) -> None:
+    code, out = check(capsys, logs_of(tmp_path, moved(seconds), HEADER), "--model", model_of(tmp_path))
+    assert code == (2 if said else 0) and ("nothing is missing" in out) is not bool(said), out
+    assert not said or out.splitlines()[-1].startswith(f"refused: {said}"), out
+
+
+def test_what_a_map_names_in_vain_is_said_as_a_diagnosis_says_it(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """A column that the file lacks, and an actuator that the model lacks; no channel is missing in the map."""
+    folder, model = logs_of(tmp_path, moved(), "t,ua,ub,qa,qb"), model_of(tmp_path)
+    text = "time: t\nctrl: {m_shoulder: ua, m_elbow: uc}\nqpos: {shoulder: qa, elbow: qb}\n"
+    (folder / "map.yaml").write_text(text)
+    code, out = check(capsys, folder, "--model", model)
+    assert code == 2 and "no column 'uc' (" in out and "ctrl.m_elbow" in out and "missing: " not in out, out
+    (folder / "map.yaml").write_text(text.replace("uc", "ub").replace("m_elbow", "m_ellbow"))
+    code, out = check(capsys, folder, "--model", model)
+    assert code == 2 and "ctrl.m_ellbow is no channel of the model; did you mean 'm_elbow'?" in out, out
+    assert "missing: " not in out
+
+
+def test_a_stray_file_is_named_beside_the_others_columns(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = logs_of(tmp_path, moved(), HEADER)
+    (folder / "a.csv").write_text("hello\nthis is a note\n")
+    (folder / "map.yaml").write_text("files: '*.csv'\ntime: time\nctrl: {m_shoulder: ctrl:m_shoulder}\n")
+    code, out = check(capsys, folder, "--model", model_of(tmp_path))
+    assert (
+        code == 2
+        and "\nrun.csv:\n" in out
+        and "\na.csv:\n" in out
+        and "qpos:elbow" in out
+        and "a.csv: no column" in out
+    ), out
+
+
+def test_the_mend_of_degrees_names_the_files_column(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = logs_of(tmp_path, rows(400) * np.array([1, 1, 1, 1, 300]), "t,ua,ub,qa,qb")
+    (folder / "map.yaml").write_text("time: t\nctrl: {m_shoulder: ua, m_elbow: ub}\nqpos: {shoulder: qa, elbow: qb}\n")
+    code, out = check(capsys, folder, "--model", model_of(tmp_path))
+    assert code == 2 and "elbow: {column: 'qb', unit: deg}" in out, out
+
+
+def test_a_log_that_a_diagnosis_leaves_out_is_the_last_word(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     logs_of(tmp_path, moved(), HEADER)
     folder = logs_of(tmp_path, moved() * np.array([1, -1, -1, 1, 1]), HEADER, "wrong.csv")
     code, out = check(capsys, folder, "--model", model_of(tmp_path))
-    assert code == 0 and "note: wrong.csv: refused: effort unrelated" in out and "nothing is missing" in out
+    assert code == 2 and "refused: wrong.csv: effort unrelated" in out and "nothing is missing" not in out
+    assert out.splitlines()[-1].startswith("1 of 2 logs refused: wrong.csv;")

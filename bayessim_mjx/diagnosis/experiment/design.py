@@ -19,7 +19,7 @@ from bayessim_mjx.diagnosis.experiment.rehearsal import Played
 from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
-from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.models import Model, systematic
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.diagnosis.statistics import root
 
@@ -148,12 +148,12 @@ class Scorer:
     def _sharper(self, S: Array, i: int, discount: float) -> float:
         k = self.models[i].size
         worst, before = self.loosest(i)
-        after = np.linalg.pinv(self.posterior[i] + discount * S[:k, :k])[worst, worst]
+        after = np.linalg.pinv(self.posterior[i] + discount * S[:k, :k])[worst, worst] + self.allowed(i)[worst]
         return float(0.5 * np.log(before / max(after, 1e-300)))
 
     def loosest(self, i: int) -> tuple[int, float]:
         """(index, variance) of model i's least certain parameter, relative to its range; effects' before known ones."""
-        variance = np.diag(np.linalg.pinv(self.posterior[i]))
+        variance = np.diag(np.linalg.pinv(self.posterior[i])) + self.allowed(i)
         coordinates, base = self.models[i].fit.coordinates, len(self.fitter.base)
         relative = np.sqrt(variance) / np.array([c.high - c.low for c in coordinates])
         first = base if len(coordinates) > base else 0
@@ -161,6 +161,10 @@ class Scorer:
         relative[base:][[self.setup.physics.quantity(c.index[0]).optional for c in coordinates[base:]]] = 0.0
         worst = first + int(np.argmax(relative[first:]))
         return worst, float(variance[worst])
+
+    def allowed(self, i: int) -> Array:
+        """Variances `[k]` of model i's parameters between simulators, which no experiment reduces."""
+        return systematic(self.models[i], self.fitter.simulator.windows.dt) ** 2
 
     def mean(self, pairs: Array) -> float:
         """Evidence over all pairs, weighted by how probable the two are."""

@@ -302,7 +302,8 @@ def reason(scorer: Scorer, chosen: Scored | None, labels: Sequence[str], contest
         index, variance = scorer.loosest(0)
         c, before = scorer.models[0].fit.coordinates[index], math.sqrt(variance)
         change = c.name, before, before * math.exp(-chosen.evidence)
-        return phrases.sharpens(action, *change) if useful else phrases.sharpens_little(chosen.name, *change)
+        allowed = math.sqrt(scorer.allowed(0)[index] / variance)
+        return phrases.sharpens(action, *change) if useful else phrases.sharpens_little(chosen.name, *change, allowed)
     if not useful:
         return phrases.separates_nobody(labels, chosen.name, chosen.evidence, instead(scorer.models))
     return phrases.tells_apart(action, labels, chosen.evidence, contested, STRONG)

@@ -68,6 +68,25 @@ class TooLittleData(Exception):
     """There is something to look at, but not enough to hold anything out; the text says what is missing."""
 
 
+def too_few(logs: Sequence[Log], dt: float, seconds: float = CUTTING.window, found: int | None = None) -> str:
+    """Say how much motion is lacking, with numbers; "" where logs hold enough windows.
+
+    Args:
+        dt: s, control period; seconds: of a window; found: windows that were cut, None: as many as fit.
+    """
+    length = max(round(seconds / dt), RULES.parts)
+    steps = [int(log.duration / dt + 1e-6) for log in logs]
+    window, longest, count = length * dt, max(steps), sum(n // length for n in steps) if found is None else found
+    if longest < length:
+        return (
+            f"the longest log has {longest * dt:.3g} s; diagnose needs windows of {window:.2g} s, better some seconds"
+        )
+    if count < CUTTING.least:
+        needs = f"{CUTTING.least}, or {CUTTING.least * window:.2g} s of motion, better half a minute"
+        return f"the logs hold {count} windows of {window:.2g} s; diagnose needs {needs}"
+    return ""
+
+
 def windows_of(
     physics: Physics,
     logs: Sequence[Log],
@@ -81,10 +100,9 @@ def windows_of(
     first: the coarsest factor that will be asked for, for which the number of windows is chosen.
     """
     dt = physics.dt
-    longest = max(int(log.duration / dt) for log in logs)
     length = max(round(seconds / dt), RULES.parts)
-    if longest < length:
-        raise TooLittleData(f"the longest log has {longest} control steps of {dt:.3g} s, one window needs {length}")
+    if lacking := too_few(logs, dt, seconds):
+        raise TooLittleData(lacking)
     most = CUTTING.most(physics, length)
     own = max(min(CUTTING.fewest, most), most // first)
 
@@ -103,8 +121,6 @@ def windows_of(
             enough=CUTTING.fewest,
         )
 
-    if len(cuts(1)) < CUTTING.least:
-        raise TooLittleData(
-            f"{len(cuts(1))} windows of {length * dt:.2g} s; holding conditions out needs {CUTTING.least}"
-        )
+    if lacking := too_few(logs, dt, seconds, len(cuts(1))):
+        raise TooLittleData(lacking)
     return cuts

@@ -11,14 +11,16 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.logcheck.drives import LEAST, Effort
+from bayessim_mjx.diagnosis.logcheck.drives import LEAST, Effort, dof_of, efforts
 from bayessim_mjx.diagnosis.logcheck.regressor import FEWEST, LOOSE, Bounded, Mask, Regressor, motion
 from bayessim_mjx.diagnosis.logcheck.rigid_body import inertial, moving_bodies, nominal
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding
 from bayessim_mjx.diagnosis.logcheck.timing import LAGS, Late, nearest
 from bayessim_mjx.effects.gravity_tilt import GravityTilt
+from bayessim_mjx.logs.excited import crossing, moved_most
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import bandwidth
+from bayessim_mjx.logs.views import sheet_of
 from bayessim_mjx.parameters.geometry import reach, tree_mass
 from bayessim_mjx.quantities import percent
 
@@ -42,7 +44,7 @@ class Relation:
         explained: share of the variance, at the best lag that physics allows; None: not tested, `text` says why.
         late: the motion behind the effort; lag: s of it where it is surely another row's and explains something, or 0.
         hold: s of the lag that a held command makes by itself: half a row.
-        mend: what would mend it, or nothing.
+        mend: what would mend it, or nothing; mended: share of the variance that it would explain.
     """
 
     joint: str
@@ -52,6 +54,7 @@ class Relation:
     lag: float = 0.0
     hold: float = 0.0
     mend: str = ""
+    mended: float = 0.0
     text: str = ""
 
     @property
@@ -72,7 +75,12 @@ def relations(log: Log, mj_model: mujoco.MjModel, found: Sequence[Effort]) -> li
     top = bandwidth(log)
     cutoffs = sorted({max(3.0, top / 2), top})  # the slower one is the quieter one
     pictures = [_Picture.of(log, mj_model, cutoff) for cutoff in cutoffs]
-    return [_relation(log, mj_model, effort, pictures) for effort in found]
+    related = [_relation(log, mj_model, effort, pictures) for effort in found]
+    tested = [r for r in related if r.explained is not None]
+    worst = min(tested, key=lambda r: r.explained or 0.0, default=None)
+    if worst is not None and (worst.explained or 0.0) < SOUND:
+        related[related.index(worst)] = _by_columns(log, mj_model, worst, top)
+    return related
 
 
 def remarks(related: Sequence[Relation]) -> list[Finding]:
@@ -136,7 +144,7 @@ def _relation(
         other = _relation(log, mj_model, effort, pictures, laden=True)
         if (other.explained or 0.0) > max(SOUND, 1.0 - HALF * (1.0 - share)):
             return other
-    return replace(relation, mend=mend)
+    return replace(relation, mend=mend, mended=share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,6 +262,37 @@ def _mend(log: Log, mj_model: mujoco.MjModel, now: Relation, curve: Array, test:
         return share, f"{mend} would explain {percent(share)}"
     spans = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in test.pieces())
     return 0.0, f"the part from {spans} alone can be explained: cut the file there" if spans else ""
+
+
+def _by_columns(log: Log, mj_model: mujoco.MjModel, now: Relation, cutoff: float) -> Relation:
+    """With the mend that explains the effort: a position of the other sign, or columns exchanged with another joint."""
+    drive_of = {log.joints[int(mj_model.dof_jntid[d])]: i for i in range(mj_model.nu)
+                if (d := dof_of(mj_model, i)) is not None}  # fmt: skip
+    mine, q, v = drive_of[now.joint], np.arange(log.qpos.shape[1]), np.arange(log.qvel.shape[1])
+    other = moved_most(sheet_of(log), log.actuators[mine], now.joint)
+    pair = [now.joint, *([other] if other in drive_of else [])]
+    at_q, at_v = ([log.channels.columns(joint, stream).start for joint in pair] for stream in ("qpos", "qvel"))
+    trials = []
+    for joint, a, b in zip(pair, at_q, at_v, strict=True):
+        turned = replace(log, qpos=log.qpos * np.where(q == a, -1.0, 1.0), qvel=log.qvel * np.where(v == b, -1.0, 1.0))
+        trials.append((turned, f"the opposite sign of the position of {joint}"))
+    if len(pair) > 1:
+        u, own = np.arange(log.ctrl.shape[1]), [mine, drive_of[other]]
+        for order, columns in ((q, at_q), (v, at_v), (u, own)):
+            order[columns] = columns[::-1]
+        names = [f"effort:{log.actuators[i]}" for i in own]
+        streams = {new: log.streams[old] for new, old in zip(names, names[::-1], strict=True) if old in log.streams}
+        words = crossing(other, log.actuators[mine], now.joint, log.actuators[own[1]])
+        positions = replace(log, qpos=log.qpos[:, q], qvel=log.qvel[:, v])
+        commands = replace(log, ctrl=log.ctrl[:, u], streams={**log.streams, **streams})
+        trials += [(positions, f"{words} Exchanged positions"), (commands, f"{words} Exchanged commands")]
+    for changed, text in trials:
+        picture = _Picture.of(changed, mj_model, cutoff)
+        mended = [e for e in efforts(changed, mj_model) if (e.joint, e.source) == (now.joint, now.source)]
+        share = max((_Test.of(changed, e, picture).share() for e in mended), default=0.0)
+        if share > SOUND and share - max(now.mended, now.explained or 0.0) > LEAST:
+            now = replace(now, mend=f"{text} would explain {percent(share)}", mended=share)
+    return now
 
 
 def _in_radians(log: Log, mj_model: mujoco.MjModel, test: _Test) -> float:

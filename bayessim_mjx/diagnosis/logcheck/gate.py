@@ -70,10 +70,23 @@ class Gate:
         return {r.log.name: "; ".join(r.of("refused")) for r in self.reports if not r.usable}
 
     @property
+    def reasons(self) -> dict[str, list[str]]:
+        """Names of the refused logs by the reason."""
+        out: dict[str, list[str]] = {}
+        for name, reason in self.refused.items():
+            out.setdefault(reason, []).append(name)
+        return out
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """One sentence each, beginning with the names of the logs."""
-        refused = tuple(f"{name}: refused: {reason}" for name, reason in self.refused.items())
-        return refused + self._all("warning") + self._not_compared()
+        refused = (f"{listed(names, most=MOST)}: refused: {reason}" for reason, names in self.reasons.items())
+        return (*refused, *self.doubts)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Warnings on usable logs."""
+        return self._all("warning") + self._not_compared()
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -93,7 +106,8 @@ class Gate:
             UserError: there is none; with every reason.
         """
         if not self.usable:
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in self.refused.items()) or "no logs were given"
+            each = (f"{listed(names, most=MOST)}: {reason}" for reason, names in self.reasons.items())
+            reasons = "; ".join(each) or "no logs were given"
             raise UserError(f"no usable log: {reasons}")
         return self.usable
 

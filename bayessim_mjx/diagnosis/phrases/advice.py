@@ -11,6 +11,7 @@ from pathlib import Path
 from bayessim_mjx.diagnosis.phrases.parameters import stand_ins
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.diagnosis.result import Verdict as Title
+from bayessim_mjx.diagnosis.statistics import of_rms
 from bayessim_mjx.effects.support.words import words
 from bayessim_mjx.quantities import percent
 
@@ -71,6 +72,9 @@ ALIKE = Verdict(
     VERDICTS["ambiguous"].headline,
     "Randomise over all explanations, or log another motion: none was found here that separates them.",
 )
+LONGER = replace(
+    VERDICTS["insufficient_data"], advice="Record longer logs, as the first sentence says, and diagnose again."
+)
 NOT_IN_MUJOCO = (
     f"Train with the corrected simulator: effects.yaml (docs/own_robot.md shows its use in Python). {MODEL} lacks "
     "a part of it, which the warnings name."
@@ -90,6 +94,12 @@ PARTLY = Verdict(
     f"Train with effects.yaml for the effects found. {BELOW}. Write its cause as "
     "an effect of your own (--effects file.py:Name), or allow more with --tolerance.",
 )
+LITTLE = Verdict(
+    Title.UNEXPLAINED.words,
+    VERDICTS["unexplained"].headline,
+    "Check the map and the logs first (bayessim-mjx logs check): signs, units, times and exchanged columns. Do not "
+    f"train with the effects: they close less than half of the gap. {BELOW}.",
+)
 REMAINDER = Verdict(
     "Effects and a remainder",
     "The named effects explain most of the gap; more than the tolerance remains.",
@@ -104,13 +114,24 @@ def verdict_of(d: Diagnosis) -> Verdict:
         return REMAINDER
     if d.verdict == "ambiguous" and d.next_experiment.get("name", "none") == "none":
         return ALIKE if d.next_experiment else UNSOUGHT
+    if d.verdict == "insufficient_data" and not d.warnings:
+        return LONGER
     if d.verdict == "parameters" and stand_ins(d.parameters):
         return EITHER
     if d.verdict == "effects" and lacks(d):
         return replace(VERDICTS["effects"], advice=NOT_IN_MUJOCO)
     found = PARTLY if d.verdict == "unexplained" and d.effects and d.gap.beyond else VERDICTS[d.verdict]
+    found = LITTLE if little(d) else found
     looked = d.where or d.next_experiment  # the stages that a short diagnosis leaves out
     return found if looked else replace(found, advice=found.advice.replace(BELOW, NOT_BELOW))
+
+
+def little(d: Diagnosis) -> bool:
+    """Whether effects are named that close less than half of the gap, and so do not explain it."""
+    if d.verdict != "unexplained" or not d.effects:
+        return False
+    gap = of_rms(d.gap.calibrated, d.gap.with_effects)
+    return gap.closed < gap.left
 
 
 def lacks(d: Diagnosis) -> bool:
@@ -130,7 +151,7 @@ def command(d: Diagnosis, folder: str | Path) -> str:
         return ""
     task, out = not model.endswith((".xml", ".mjcf")), Path(folder)
     said = ["bayessim-mjx"]
-    if d.verdict == "insufficient_data":
+    if d.verdict == "insufficient_data" or little(d):
         said += ["logs", "check", data[0], *([] if task else ["--model", model])]
     elif d.next_experiment.get("file") and d.verdict in ("ambiguous", "unexplained"):
         again = [*data, str(out.with_name("new_logs")), "--out", str(out.with_name(f"{out.name}_2"))]
@@ -187,15 +208,20 @@ def run_experiment(name: str, seconds: float) -> str:
 
 
 def sharpens(action: str, parameter: str, before: float, after: float) -> str:
-    """Return the gain in accuracy of a parameter, where no rival is left.
-
-    As a ratio: both are of noise alone, and so smaller than the standard deviation that the diagnosis reports.
-    """
+    """Return the gain in accuracy of a parameter, where no rival is left, as a ratio."""
     return f"{action}: it should divide the standard deviation of {parameter} by {before / after:.2g}"
 
 
-def sharpens_little(best: str, parameter: str, before: float, after: float) -> str:
-    """Say that no experiment helps; best: its name, with the parameter that it measures best."""
+def sharpens_little(best: str, parameter: str, before: float, after: float, allowed: float = 0.0) -> str:
+    """Say that no experiment helps.
+
+    Args:
+        best: name of the best one, with the parameter that it measures best.
+        allowed: share of the standard deviation that allows for other simulators.
+    """
+    if 2 * allowed**2 > 1:  # most of the variance
+        share = percent(allowed)
+        return f"no experiment sharpens {parameter}: {share} of its standard deviation allows for other simulators"
     left = percent(after / before)
     return (
         f"no experiment of the menu adds much; the best, {best}, leaves {left} of the standard deviation of {parameter}"

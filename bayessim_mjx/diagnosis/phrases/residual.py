@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bayessim_mjx.diagnosis.result import Diagnosis, Place
-from bayessim_mjx.diagnosis.statistics import Gap, of_one
-from bayessim_mjx.quantities import MOST, count, listed, percent
+from bayessim_mjx.diagnosis.statistics import Gap, of_one, of_rms
+from bayessim_mjx.quantities import MOST, count, finite, listed, percent
 
 if TYPE_CHECKING:
     from bayessim_mjx.diagnosis.residual.black_boxes import BlackBoxes, Flexible
@@ -62,6 +62,22 @@ def parted(d: Diagnosis) -> tuple[list[str], list[str]]:
     """
     first = [text for text in d.sentences[1:] if not (d.effects and text.startswith(WITHOUT))]
     return first, [text for text in d.sentences[1:] if text not in first]
+
+
+def beside_effects(d: Diagnosis) -> str:
+    """Say how much of the gap a flexible force closes beside the named effects, and whether that is relevant."""
+    rms = (d.details.get("flexible") or {}).get("rms_on_winner")
+    if not d.effects or not finite(rms):
+        return ""
+    stages = (of_rms(d.gap.calibrated, level).closed for level in (d.gap.with_effects, rms))
+    now, with_force = stages
+    rest, limit = max(with_force - now, 0.0), (d.details.get("force_left") or {}).get("relevant_share")
+    said = f"Beside the named effects it closes {percent(rest)} of the squared gap above the noise"
+    if not finite(limit):
+        return f"{said}."
+    if rest <= limit:
+        return f"{said}. Relevant is more than {percent(limit)}: no further cause follows from it."
+    return f"{said}, more than the relevant {percent(limit)}: a cause without a name remains."
 
 
 def located(found: Located) -> list[str]:

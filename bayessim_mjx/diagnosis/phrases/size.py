@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from bayessim_mjx.diagnosis.phrases.advice import little
 from bayessim_mjx.diagnosis.phrases.verdict import number, stage
 from bayessim_mjx.diagnosis.result import Diagnosis
 from bayessim_mjx.diagnosis.statistics import of_one
@@ -37,7 +38,8 @@ def no_help(d: Diagnosis) -> str:
 
 def with_effects(d: Diagnosis) -> str:
     """Name the stage with the effects: in a headline that names none they are the nearest ones."""
-    return "with the nearest effects" if d.verdict == "unexplained" and not d.gap.beyond else "with the effects"
+    near = little(d) or (d.verdict == "unexplained" and not d.gap.beyond)
+    return "with the nearest effects" if near else "with the effects"
 
 
 def _stages(d: Diagnosis) -> dict[str, str]:

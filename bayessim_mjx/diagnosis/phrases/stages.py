@@ -2,6 +2,7 @@
 
 WORDS = {
     "screening": "trying every effect roughly",
+    "more starting points": "trying every effect roughly, from more starting points",
     "single effects": "fitting one effect at a time",
     "screening again": "trying every further effect roughly",
     "sets of effects": "fitting several effects together",

@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from bayessim_mjx.diagnosis.phrases import advice, notes, parameters, residual
 from bayessim_mjx.diagnosis.phrases import effects as named
-from bayessim_mjx.diagnosis.phrases import notes, parameters, residual
-from bayessim_mjx.diagnosis.result import Diagnosis, FoundEffect, Gap
+from bayessim_mjx.diagnosis.result import Diagnosis, Gap
 from bayessim_mjx.diagnosis.selection.numbers import ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import above_noise, of_one, of_rms
-from bayessim_mjx.quantities import MOST, extent, finite, listed, percent
+from bayessim_mjx.quantities import MOST, count, extent, finite, listed, percent
 
 SHARES = ("predicted", "realised", "elsewhere")  # of `Gap.closed`; effects that widen the gap close none
 HEADS = {
@@ -60,6 +60,10 @@ BEHIND = (
     "The held-out score alone ranks it {rank} of {count}, {behind} nats behind the first{error}. The verdict goes by "
     "the probability."
 )
+FURTHER = (
+    "Ahead by the held-out score: {sets} with further effects. These close at most {more} more of the gap, less than "
+    "the relevant {share}, and so count as this one."
+)
 PAST = "The missing force depends on something else, such as the past of the motion."
 SPLITS = "To separate the explanations, run the next experiment: {name}."
 HIDDEN = (
@@ -75,6 +79,7 @@ BENT = (
     "chance, even if the data sheet is half as inaccurate again as stated. Something else may be missing, or the data "
     "sheet is of another robot (--accuracy, --parameters)."
 )
+ALLOWED = "Standard deviations allow for other simulators, which no data reduce. By the logs alone: {each}."
 OF_SENSORS = "The residual has the covariance of sensor noise, {colour}."
 CHANCE = (
     "No candidate and no flexible force predicts the residual, {calibrated}, on held-out {held}. Possible causes: "
@@ -103,7 +108,8 @@ def sentences(d: Diagnosis) -> list[str]:
         texts += [PAST] if basis.get("remains") and not residual.predicts(basis["flexible"]) else []
     if basis.get("efforts"):
         texts.append(f"By the logged efforts alone, {basis['efforts']}.")
-    texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in d.effects if _at_bound(e)]
+    ends = [e for e in d.effects if any(v.bound not in ("", "off") for v in e.parameters.values())]
+    texts += [f"At its bound: {named.titled(e.name, e.where)}. {e.sentence}" for e in ends]
     texts += parameters.remarks(d.parameters, said=d.verdict == "parameters")
     texts += [named.not_on_offer(basis["tried"])] if d.verdict == "unexplained" and basis.get("tried") else []
     return [text for text in [*texts, notes.not_tried(basis.get("not_tried"))] if text]
@@ -127,8 +133,8 @@ def _head(d: Diagnosis) -> str:
         first = named.capital((head + SMALL * above).format(**fill))
         return " ".join([first + _acts(d), *far_off])
     if d.verdict == "unexplained":
-        gap = of_rms(far.calibrated, far.with_effects)
-        head = f"{PARTLY_HEAD} {REST}" if far.beyond else PART if gap.closed > gap.left else HEADS["unexplained"]
+        head = HEADS["unexplained"] if advice.little(d) else PARTLY_HEAD if far.beyond else PART
+        head += f" {REST}" if far.beyond else ""
         return head.format(named=named.lacking(d.effects), **fill) + _acts(d)
     several = {a["effect"]: a for a in d.answers if len(a["members"]) > 1}
     open_ = [named.answer(e, several[label]) for e in d.effects if (label := f"{e.name}@{e.where}") in several]
@@ -172,11 +178,12 @@ def _how_far(d: Diagnosis) -> list[str]:
     far, basis, out = d.gap, d.basis, []
     left = of_rms(far.calibrated, far.with_effects).left
     if d.effects:
-        nearest = d.verdict == "unexplained" and not far.beyond
+        little = advice.little(d)
+        nearest = d.verdict == "unexplained" and (little or not far.beyond)
         out += [NEAREST.replace("{nearest}", "; ".join(map(named.line, d.effects)))] if nearest else []
         out.append(FALLS)
         if d.verdict == "unexplained":
-            out += [LITTLE] if of_rms(far.calibrated, far.with_effects).closed < left else []
+            out += [LITTLE] if little else []
             remains = basis.get("remains") or 0.0
             out += [(ON_TOP if remains <= 1 else LARGER).replace("{remains}", percent(remains))] if remains > 0 else []
         out += [IMPERFECT] if far.beyond and d.verdict != "unexplained" and left > 0 else []
@@ -200,6 +207,17 @@ def _doubts(d: Diagnosis) -> list[str]:
     if d.basis.get("builds_up"):
         times, window = f"{d.basis['builds_up']:.2g}", f"{d.basis['window']:.2g} s"
         out.append(BUILDS_UP.format(times=times, window=window))
+    known_by = [
+        (named.titled(e.name, e.where), p.sd, math.sqrt(max(p.sd**2 - p.allowed**2, 0.0)), p.unit)
+        for e in d.effects
+        for p in [*e.parameters.values()][:1]
+        if finite(p.sd) and 2 * p.allowed**2 > p.sd**2
+    ]
+    scaled = [
+        (name, 1e3 * sd, 1e3 * own, "ms") if unit == "s" else (name, sd, own, unit) for name, sd, own, unit in known_by
+    ]
+    each = [f"{own:.2g} of the {f'{sd:.2g} {unit}'.rstrip()} of {name}" for name, sd, own, unit in scaled]
+    out += [ALLOWED.format(each=listed(each, most=3))] if each else []
     return out
 
 
@@ -229,10 +247,24 @@ def _behind(d: Diagnosis) -> str:
     if rank in (None, 1) or not _probable(d):
         return ""
     first, own = d.candidates[0], d.candidates[rank - 1]
-    if first["score"] - own["score"] < math.log(ODDS.strong):
+    ahead = [c for c in d.candidates[: rank - 1] if c["score"] - own["score"] >= math.log(ODDS.strong)]
+    if not ahead:
         return ""
+    if all(counts_as_answer(d, c) for c in ahead):
+        ahead = [c for c in d.candidates[: rank - 1] if counts_as_answer(d, c)]
+        more = percent(max(0.0, *(c["gap_closed"] - own["gap_closed"] for c in ahead)))
+        return FURTHER.format(sets=count(len(ahead), "set"), more=more, share=percent(RELEVANCE.share))
     error = f" (standard error {first['se']:.0f})" if finite(first.get("se")) else ""
     return BEHIND.format(rank=rank, count=len(d.candidates), behind=f"{first['score'] - own['score']:.0f}", error=error)
+
+
+def counts_as_answer(d: Diagnosis, candidate: Mapping[str, Any]) -> bool:
+    """Whether a set holds the named effects and others that close an irrelevant share of the gap (docs/evidence.md)."""
+    named, own = {f"{e.name}@{e.where}" for e in d.effects}, d.candidates[(d.rank or 1) - 1]
+    if d.rank is None or not named < set(candidate.get("effects") or []):
+        return False
+    more = (candidate.get("gap_closed") or math.nan) - (own.get("gap_closed") or math.nan)
+    return bool(more < RELEVANCE.share)
 
 
 def coasting(far: Gap, named: bool) -> str:
@@ -242,10 +274,6 @@ def coasting(far: Gap, named: bool) -> str:
     closed = of_rms(far.coasting, far.with_effects).closed
     more = COASTS_CLOSED.format(closed=percent(max(closed, 0.0))) if named and finite(closed) else ""
     return COASTS.format(coasting=number(far.coasting), calibrated=number(far.calibrated), more=more)
-
-
-def _at_bound(effect: FoundEffect) -> bool:
-    return any(v.bound not in ("", "off") for v in effect.parameters.values())
 
 
 def stage(far: Gap, name: str) -> str:

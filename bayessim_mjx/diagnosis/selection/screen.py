@@ -238,7 +238,7 @@ def simulated(
     for first in range(0, len(plans), at_once):
         if done + first and over is not None and over():
             return
-        say("screening", done + first, done + len(plans))
+        say("more starting points" if done else "screening", first, len(plans))
         now = plans[first : first + at_once]
         thetas = [
             fitter.vector((*fit.coordinates, *c.coordinates), np.concatenate([fit.values, point])) for c, point in now

@@ -22,7 +22,7 @@ from bayessim_mjx.diagnosis.phrases import parameters as remarks
 from bayessim_mjx.diagnosis.phrases.effects import CLEAR
 from bayessim_mjx.diagnosis.result import Estimate, FoundEffect
 from bayessim_mjx.diagnosis.selection import bounds, heldout
-from bayessim_mjx.diagnosis.selection.models import Model
+from bayessim_mjx.diagnosis.selection.models import Model, systematic
 from bayessim_mjx.diagnosis.setup import Setup
 from bayessim_mjx.effects.support.actuators import OfGains, OfLoops
 from bayessim_mjx.effects.support.words import spelt
@@ -126,11 +126,13 @@ def _effect(found: Findings, effect: Candidate, sd: Array, part: dict[str, Any])
     weight_of = dict(zip(map(id, weighed), weights[1:], strict=True))
     own = [model.fit.names.index(c.name) for c in effect.coordinates]
     numbers, ends = {}, []
+    allowed = systematic(model, setup.fitter.simulator.windows.dt)
     for i, c in zip(own, effect.coordinates, strict=True):
         value, word = float(model.fit.values[i]), c.name.rsplit(".", 1)[1]
         bound = bounds.of(setup.physics, c, value)
         deviation = float(sd[i]) if bound is None or bound.kind == "off" else float("nan")
-        numbers[word] = Estimate(value, deviation, _unit(setup, effect, c.unit), bound.kind if bound else "")
+        unit, kind = _unit(setup, effect, c.unit), bound.kind if bound else ""
+        numbers[word] = Estimate(value, deviation, unit, kind, float(allowed[i]))
         clause = (
             phrases.at_bound(bound, c.unit)
             if bound

@@ -2,6 +2,7 @@
 
 import functools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -10,6 +11,7 @@ import yaml
 
 from bayessim_mjx.diagnosis.evidence.selecting import Selection
 from bayessim_mjx.diagnosis.evidence.weighing import Weighed
+from bayessim_mjx.diagnosis.experiment.design import Scorer
 from bayessim_mjx.diagnosis.experiment.limits import limits_of
 from bayessim_mjx.diagnosis.experiment.propose import propose
 from bayessim_mjx.diagnosis.findings import Findings
@@ -217,3 +219,19 @@ def test_limits_come_from_the_model_and_else_from_the_logs():
 def test_wrong_limits_are_refused(given):
     with pytest.raises(UserError, match="limits"):
         limits_of(robot().mj_model, slow_logs(), given)
+
+
+def test_an_experiment_promises_no_more_than_other_simulators_allow():
+    """Variances: 1 of the logs, which three times as many data quarter, and 24 between simulators: 25 becomes 24.25."""
+    known = SimpleNamespace(optional=False)
+    scorer = object.__new__(Scorer)
+    coordinate = SimpleNamespace(low=0.0, high=1.0, index=(0,))
+    scorer.__dict__.update(
+        models=[SimpleNamespace(size=1, fit=SimpleNamespace(coordinates=[coordinate]))],
+        fitter=SimpleNamespace(base=()),
+        posterior=[np.eye(1)],
+        setup=SimpleNamespace(physics=SimpleNamespace(quantity=lambda i: known)),
+        allowed=lambda i: np.array([24.0]),
+    )
+    assert scorer.loosest(0) == (0, pytest.approx(25.0))
+    assert scorer._sharper(3.0 * np.eye(1), 0, 1.0) == pytest.approx(0.5 * np.log(25.0 / 24.25))

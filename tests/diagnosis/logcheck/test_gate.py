@@ -49,6 +49,14 @@ def warned(log: Log, *words: str, xml: str = PENDULUM) -> Gate:
     return gate
 
 
+def test_exchanged_commands_are_named(arm: Log) -> None:
+    """Only with them exchanged the inverse dynamics explain the efforts."""
+    said = " ".join(judge(dataclasses.replace(arm, ctrl=arm.ctrl[:, ::-1]), ARM).warnings)
+    assert "are the columns swapped? Exchanged commands would explain 100 %" in said
+    said = " ".join(judge(dataclasses.replace(arm, qpos=arm.qpos[:, ::-1], qvel=arm.qvel[:, ::-1]), ARM).warnings)
+    assert "are the columns swapped? Exchanged positions would explain" in said
+
+
 def test_good_logs_pass_without_a_word(good: Log, arm: Log) -> None:
     for log, xml in ((good, PENDULUM), (arm, ARM)):
         gate = judge(log, xml)

@@ -25,6 +25,8 @@ RANKED = [
     {"effects": [*labels], "score": score, "se": 151.0}
     for labels, score in ((("gain@torque",), 2162.0), (("coulomb_friction@hinge",), 2085.0), ((), 0.0))
 ]
+FURTHER = [RANKED[0] | {"effects": ["coulomb_friction@hinge", "gain@torque"], "gap_closed": 0.9815},
+           RANKED[1] | {"gap_closed": 0.98}, RANKED[2]]  # fmt: skip
 BASIS = {"window": 0.5, "remains": 0.0, "above_noise": True}
 
 
@@ -40,6 +42,7 @@ def effect(name, where, closed=0.5, rivals=(), shared=None, **numbers):
 
 FRICTION = effect("coulomb_friction", "hinge", 0.66, level=(0.1497, 0.0087, "N m"))
 GAIN = effect("actuator_gain", "torque", 0.32, gain=(0.698, 0.036, ""))
+SHARP = effect("coulomb_friction", "hinge", 0.66, level=(0.12, 0.0013, "N m", "", 0.0012))
 UNSURE = effect("actuator_gain", "torque", 0.32, gain=(1.05, 0.55, ""))
 DELAY = effect(
     "actuator_delay", "torque", 0.98, [["actuator_lag@torque"], ["sensor_delay@hinge"]],
@@ -111,15 +114,13 @@ def every():
         "noise with a memory": made("noise", noise_memory=0.06),
         "one effect": made("effects", [FRICTION], probability=chance),
         "another set with the best score": made("effects", [FRICTION], probability=chance, candidates=RANKED),
+        "a larger set with the best score": made("effects", [FRICTION], probability=chance, candidates=FURTHER),
         "two effects": made("effects", [FRICTION, GAIN], hidden=["viscous_friction@hinge"]),
         "one law at two joints": made("effects", [FRICTION, dataclasses.replace(FRICTION, where="elbow")]),
         "one log": made("effects", [FRICTION], gap(closed=ALONE, in_sample=True)),
         "a remainder": made("effects", [FRICTION], some),
         "much is left within the tolerance": made("ambiguous", [FRICTION, PAYLOAD], gap(with_effects=6.0)),
-        "an effect at its bound": made(
-            "effects",
-            [dataclasses.replace(END, sentence="Gap ends.")],
-        ),
+        "an effect at its bound": made("effects", [dataclasses.replace(END, sentence="Gap ends.")]),
         "a class with a number": made("ambiguous", [DELAY], experiment=run, probability=chance),
         "a class without a number": made("ambiguous", [FRICTION, PAYLOAD]),
         "a class that no motion separates": made("ambiguous", [FRICTION, PAYLOAD], experiment={"name": "none"}),
@@ -131,9 +132,11 @@ def every():
         "little is closed": made(
             "unexplained", [GAIN], gap(with_effects=8.0), probability=chance, remains=0.4, flexible=NOTHING
         ),
+        "little is closed, far beyond": made("unexplained", [GAIN], dataclasses.replace(some, with_effects=8.0)),
         "beside joints that keep their speed": made("unexplained", [GAIN], gap(with_effects=6.0, coasting=5.0)),
         "known parameters": made("effects", [FRICTION], parameters=known, builds_up=3.0),
         "a heavier link": made("effects", [FRICTION], parameters=heavier, accuracy={"mass": {"low": 0.15}}),
+        "known better than simulators agree": made("effects", [SHARP]),
         "one parameter": made("effects", [FRICTION], parameters=few, efforts="the motors follow"),
     }  # fmt: skip
 

@@ -18,6 +18,7 @@ Said = dict[str, Any]
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
 AT_NOISE = 1.15  # noise sd (docs/decisions/at_noise.md)
 UNEXPLAINED = 0.15  # share left, from which on effects are no explanation (`summary.verdict.Limits.share`)
+RELEVANT = 0.003  # share of the gap (docs/decisions/relevance_and_odds.md)
 CLEARLY = 3.0  # nats: odds of 20 (docs/decisions/relevance_and_odds.md)
 IN_UNIT = {"ms": 1e-3, "deg": math.pi / 180, "mm": 1e-3}
 
@@ -124,10 +125,19 @@ def _quoted(said: Said) -> Iterator[tuple[str, str]]:
         if not any(v is not None and rounds_to(100 * v, of) for v in values):
             yield "share", f"'{before} {of} %', in the data {[round(v, 4) for v in values if v is not None]}"
     known = [*numbers(said), *(1 - v for v in numbers(gap)), *sheet.values(), 1 - sheet["effects"], 0.9, 0.1]
+    known += [RELEVANT, *_further(said)]
     known += [a / b for r in gap["physical"].values() for a in numbers(r) for b in [r.get("motion") or 0.0] if b]
     for of in re.findall(rf"({NUMBER}) ?%", text_of(said)):
         if not any(rounds_to(100 * v, of) for v in known):
             yield "source", f"{of} % is no number of the result"
+
+
+def _further(said: Said) -> list[float]:
+    """Share of the gap that each set with the named effects and others closes beyond these."""
+    named = {f"{e['name']}@{e['where']}" for e in said["effects"]}
+    closed = {frozenset(c["effects"]): c.get("gap_closed") for c in said["candidates"]}
+    own = closed.get(frozenset(named))
+    return [] if own is None else [v - own for of, v in closed.items() if named < of and v is not None]
 
 
 def _falls(said: Said) -> dict[str, tuple[float, float]]:
@@ -246,7 +256,10 @@ def _ranked(said: Said) -> Iterator[tuple[str, str]]:
     if quoted and int(quoted[1]) not in ranks:
         yield "rank", f"ranks {quoted[1]}, in the table {ranks}"
     behind = said["candidates"][0]["score"] - said["candidates"][ranks[0] - 1]["score"] if ranks else 0.0
-    if behind >= CLEARLY and "Probability among" in text_of(said) and not quoted:
+    alike = re.search(rf"Ahead by the held-out score: (\d+) .* at most ({NUMBER}) % more", text_of(said))
+    if alike and (int(alike[1]) >= ranks[0] or max(_further(said)) > RELEVANT):
+        yield "rank", f"{alike[1]} sets are said to be ahead with an irrelevant share, {_further(said)} in the table"
+    if behind >= CLEARLY and "Probability among" in text_of(said) and not (quoted or alike):
         yield "rank", f"the most probable set is number {ranks[0]} of the table, and no sentence says so"
 
 

@@ -29,4 +29,6 @@ def test_why_an_experiment_is_proposed():
     assert phrases.sharpens_little("release", "mass", 0.2, 0.16) == (
         "no experiment of the menu adds much; the best, release, leaves 80 % of the standard deviation of mass"
     )
+    text = phrases.sharpens_little("release", "mass", 0.2, 0.199, 0.98)
+    assert text == "no experiment sharpens mass: 98 % of its standard deviation allows for other simulators"
     assert phrases.separating(["unheard_of"]) == "a known payload, two mount orientations, or a measured effort"

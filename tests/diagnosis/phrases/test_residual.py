@@ -1,10 +1,13 @@
 """Residual forces in words: sentences known beforehand."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from bayessim_mjx.diagnosis.phrases import residual
+from tests.diagnosis.phrases.cases import FRICTION, gap, made
 
 UNITS = {"speed": "rad/s", "position": "rad", "direction": "", "time since reversal": "s", "load": "N m"}
 
@@ -43,3 +46,19 @@ def test_a_flexible_force_removes_a_share_of_the_residual_above_the_noise():
     found.condition = held(1.3, 0.2)
     (text,) = residual.flexible(residual.flexible_of(found, "recalibrated"))
     assert text.startswith("The residual of the recalibrated simulator") and "within the measurement noise" in text
+
+
+@pytest.mark.parametrize(
+    ("rms", "said"),
+    [
+        (1.0, "closes 3.0 % of the squared gap above the noise. Relevant is more than 10 %"),
+        (None, ""),
+    ],
+)
+def test_a_flexible_force_that_closes_little_beside_the_effects_is_no_missing_cause(rms, said):
+    """From 2 to 1 noise sd, of 10: 3 of the 99 above the noise, in squares."""
+    details = {"flexible": {"rms_on_winner": rms}, "force_left": {"relevant_share": 0.1}}
+    found = made("effects", [FRICTION], gap(calibrated=10.0, with_effects=2.0), details=details)
+    assert said in residual.beside_effects(found) and "remains" not in residual.beside_effects(found)
+    large = dataclasses.replace(found, gap=gap(calibrated=10.0, with_effects=5.0))
+    assert ("a cause without a name remains" in residual.beside_effects(large)) == (rms is not None)

@@ -191,6 +191,8 @@ def test_a_model_for_mujoco_that_lacks_an_effect_is_not_advised():
 def test_too_little_data_leads_to_a_check_of_the_logs():
     found = dataclasses.replace(made("no_gap"), verdict="insufficient_data", about=ABOUT | {"model": "arm.xml"})
     assert advice.command(found, "found") == "bayessim-mjx logs check 'my logs' --model arm.xml"
+    assert "warnings" not in advice.verdict_of(found).advice
+    assert "as the warnings say" in advice.verdict_of(dataclasses.replace(found, warnings=["a note"])).advice
 
 
 def test_an_experiment_is_advised_only_where_there_is_one():
@@ -200,6 +202,33 @@ def test_an_experiment_is_advised_only_where_there_is_one():
     assert "without --quick" in advice.verdict_of(without).advice  # nobody searched for one
     none = made("ambiguous", [PAYLOAD], experiment={"name": "none"})
     assert "none was found here" in advice.verdict_of(none).advice
+
+
+def test_effects_that_close_less_than_half_lead_to_the_map_and_not_to_training():
+    """Of 99 above the noise 8 noise sd leave 63: the effects close 36 % of the squared gap."""
+    far = dataclasses.replace(cases.every()["partly"].gap, calibrated=10.0, with_effects=8.0)
+    found = dataclasses.replace(made("unexplained", [GAIN], far), about=ABOUT | {"model": "arm.xml"})
+    assert "map and the logs first" in advice.verdict_of(found).advice
+    assert "Train with effects.yaml" not in advice.verdict_of(found).advice
+    assert advice.command(found, "found") == "bayessim-mjx logs check 'my logs' --model arm.xml"
+    assert found.sentences[0].startswith("No effect of the library explains the gap")
+
+
+def test_a_set_with_further_effects_that_close_nothing_is_no_other_answer():
+    """By the rule of relevance, .3 % of the squared gap: .15 % more counts as the answer, .9 % more does not."""
+    own = cases.every()["a larger set with the best score"]
+    assert [verdict.counts_as_answer(own, c) for c in own.candidates] == [True, False, False]
+    assert "1 set with further effects. These close at most 0.15 % more of the gap" in " ".join(own.sentences)
+    much = [own.candidates[0] | {"gap_closed": 0.989}, *own.candidates[1:]]
+    text = " ".join(verdict.sentences(dataclasses.replace(own, candidates=much)))
+    assert "further effects" not in text and "ranks it 2 of 3, 77 nats behind" in text
+
+
+def test_of_a_standard_deviation_the_part_of_the_logs_is_said_where_it_is_the_smaller_one():
+    """.0005 of .0013, as .0013^2 = .0012^2 + .0005^2."""
+    text = " ".join(cases.every()["known better than simulators agree"].sentences)
+    assert "By the logs alone: 0.0005 of the 0.0013 N m of Coulomb friction at hinge." in text
+    assert "By the logs alone" not in " ".join(cases.every()["one effect"].sentences)
 
 
 def test_effects_within_the_tolerance_that_explain_nothing_are_no_part_of_an_explanation():
