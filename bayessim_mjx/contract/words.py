@@ -194,7 +194,7 @@ NOTES = {
     "rebuilt": "no observations in the log: the actions follow from the logged state as the manifest says",
     "rebuilt_unlike": (
         "no observations in the log, and no single mistake that was tried explains the actions: several mistakes, "
-        "another policy, or noise of the log; log the policy's observations (observation:<name>), which tell them apart"
+        "another policy, or noise of the log; log the policy's observations (observation:<name>), which separate them"
     ),
     "not_rebuilt": "no observations in the log, and its state does not give all of them: log observation:<name>",
     "no_scale": "commands are no multiples of the actions: they are not compared",
