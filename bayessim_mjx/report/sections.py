@@ -103,7 +103,7 @@ def simulated(d: Diagnosis) -> str:
     if finite(step):
         parts.append(f"errors at time steps of {number(1e3 * step)} ms ({a.get('integrator')})")
         coarser = finite(own) and own > 1.01 * step and d.effects
-        parts += [f"{MODEL} steps {number(1e3 * own)} ms, and its error is larger"] if coarser else []
+        parts += [f"{MODEL} steps {number(1e3 * own)} ms, where the error may be larger"] if coarser else []
     parts += [f"--{flag} {' '.join(texts)}" for flag, texts in (a.get("stated") or {}).items() if texts]
     return capital("; ".join(parts))
 

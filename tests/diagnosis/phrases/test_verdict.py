@@ -179,7 +179,7 @@ def test_the_command_can_be_pasted(name, effects, about, experiment, words):
 
 
 def test_a_viewer_is_no_training():
-    assert advice.purpose("python -m mujoco.viewer --mjcf=found/a.xml") == "look at it"
+    assert advice.purpose("python -m mujoco.viewer --mjcf=found/a.xml") == "view it"
     assert advice.purpose("bayessim-mjx train --task Pendulum") == "next"
 
 
