@@ -58,7 +58,8 @@ def load(path: Path, text: str | None = None, packages: Sequence[str] = ()) -> m
         UserError: there is no such file, MuJoCo cannot load it, or see `read` and `drive`.
     """
     if not path.is_file():
-        raise UserError(f"--model {path}: no such file")
+        what = "a folder; give the file in it" if path.is_dir() else "no such file"
+        raise UserError(f"--model {path}: {what}")
     try:
         spec = read(path, packages)
     except ValueError as error:

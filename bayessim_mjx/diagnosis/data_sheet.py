@@ -45,7 +45,12 @@ def accuracies(texts: Sequence[str], space: ParameterSpace, default: float | Non
     """
     own = {p.name: default for p in space.parameters if default is not None and _open(p)}
     for part, name, value in assigned(texts):
-        share, _ = measure(f"--accuracy {part}", value, {"%": 0.01, "": 1.0}, "a share above 0, as in 5% or mass=2%")
+        allowed = "a share above 0, as in 5% or mass=2%"
+        share, unit = measure(f"--accuracy {part}", value, {"%": 0.01, "": 1.0}, allowed)
+        if not unit and share > 1:
+            raise UserError(
+                f"--accuracy {part}: {value} is {100 * share:g} %; did you mean {value}%? allowed: {allowed}"
+            )
         named = [p.name for p in space.parameters if not name or _called(p, name)]
         if not named:
             every = [*dict.fromkeys(p.attribute for p in space.parameters), *space.names]

@@ -176,12 +176,12 @@ def diagnose(
         UserError: model, logs, effects or tolerance are not usable.
     """
     given: list[Any] = [logs] if isinstance(logs, str | Path | Log) else list(logs)
-    flags = [[texts] if isinstance(texts, str) else texts for texts in (accuracy, payload, tolerance)]
+    flags = [[texts] if isinstance(texts, str) else [*texts] for texts in (accuracy, payload, tolerance)]
     with noting() as noticed:
         robot = robot_of(model, parameters).stated(*flags[:2])
         read = all(isinstance(log, Log) for log in given)
         recorded = given if read else read_logs(given if given[1:] else given[0], robot.mj_model, map, partial=True)
-    about = header(robot, model, given, recorded) | {"seed": seed} | dict(about or {})
+    about = header(robot, model, given, recorded, flags) | {"seed": seed} | dict(about or {})
     files = Files(None if out is None else Path(out), about, progress, early)
     request = Request(
         effects=effects, group=group, seed=seed, minutes=minutes, quick=quick, verdict_only=verdict_only,

@@ -71,7 +71,8 @@ def parameters(d: Diagnosis) -> dict[str, Any]:
     found = d.details.get("groups") or {}
     estimates = found.get("parameters") or {} if found.get("names") else {}
     moves = sorted(estimates, key=lambda k: not d.parameters.get(k, {}).get("structural"))
-    figure = rival_figures.groups(found["names"], {k: estimates[k] for k in moves}, d.parameters) if moves else None
+    drawn = {k: _of_robot(estimates[k], d.parameters.get(k, {})) for k in moves}
+    figure = rival_figures.groups(found["names"], drawn, d.parameters) if moves else None
     names = found.get("names") or []
     numbered = [] if rival_figures.fits(names) else names
     left = max(len(moves) - 12, 0)
@@ -83,6 +84,13 @@ def parameters(d: Diagnosis) -> dict[str, Any]:
         "numbered": numbered,
         "left": left,
     }
+
+
+def _of_robot(row: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
+    """Move estimates per condition from the simulated value to the robot's, which the table has."""
+    own, simulated = known.get("mean"), known.get("simulated")
+    move = own - simulated if finite(own) and finite(simulated) else 0.0
+    return {**row, "mean": [m + move if finite(m) else m for m in row["mean"]]}
 
 
 def isolability(d: Diagnosis) -> dict[str, Any]:

@@ -59,6 +59,7 @@ def render(d: Diagnosis, missed: Any = None, link: str = "", folder: Path = Path
             missed=missed,
             missed_link=quote(link) if link else missed and missed.page.as_uri(),
             versions=d.versions,
+            simulated=sections.simulated(d),
         )
     )
 

@@ -1,10 +1,11 @@
 """The sections of the page: plain dicts for the template, empty where the diagnosis has nothing to show."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
+from bayessim_mjx.diagnosis.phrases.advice import MODEL, command, headline, purpose, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
 from bayessim_mjx.diagnosis.phrases.size import below_tiles, no_help, with_effects
@@ -55,6 +56,7 @@ def top(d: Diagnosis, folder: Path) -> dict[str, Any]:
         "sentences": parted(d)[0],
         "advice": verdict.advice,
         "command": command(d, folder),
+        "purpose": purpose(command(d, folder)),
         "tiles": [{"words": TILES.get(s) or with_effects(d), "colour": STAGE[s], **_tile(d, s)} for s in shown],
         "size": below_tiles(d) if shown else "",
         "no_help": no_help(d),
@@ -92,6 +94,18 @@ def about(d: Diagnosis) -> list[str]:
     return [
         text for text in (a.get("robot"), f"{logs}{where_}" if data else "", ", ".join(size), a.get("date")) if text
     ]
+
+
+def simulated(d: Diagnosis) -> str:
+    """Return step and integrator of the errors, and what the user stated: short phrases."""
+    a, parts = d.about, []
+    step, own = (float(a.get(key) or math.nan) for key in ("timestep", "model_timestep"))
+    if finite(step):
+        parts.append(f"errors at time steps of {number(1e3 * step)} ms ({a.get('integrator')})")
+        coarser = finite(own) and own > 1.01 * step and d.effects
+        parts += [f"{MODEL} steps {number(1e3 * own)} ms, where the error may be larger"] if coarser else []
+    parts += [f"--{flag} {' '.join(texts)}" for flag, texts in (a.get("stated") or {}).items() if texts]
+    return capital("; ".join(parts))
 
 
 def how_far(d: Diagnosis) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
-from bayessim_mjx.diagnosis.phrases.advice import command, headline, verdict_of
+from bayessim_mjx.diagnosis.phrases.advice import command, headline, purpose, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
 from bayessim_mjx.diagnosis.phrases.size import gap_line
@@ -35,7 +35,7 @@ def console(
     with Console(file=file, headless=headless) as out:
         out.panel(verdict_of(diagnosis).badge, _first(diagnosis), TONES[diagnosis.verdict][0])
         if folder is not None and (text := command(diagnosis, folder)):
-            out.command("next", text)
+            out.command(purpose(text), text)
         for warning in diagnosis.warnings:
             out.warning(signs(warning))
         _tables(out, diagnosis, (_effects, _parameters))

@@ -64,7 +64,7 @@ def test_accuracies_by_what_and_by_whose_and_later_ones_win(arm):
     }
 
 
-@pytest.mark.parametrize("text", ["weight=5%", "five", "0%", "mass=-2%", "mass="])
+@pytest.mark.parametrize("text", ["weight=5%", "five", "5", "mass=2", "0%", "mass=-2%", "mass="])
 def test_accuracies_that_make_no_sense(arm, text):
     with pytest.raises(UserError, match="--accuracy"):
         data_sheet.accuracies((text,), arm.space, None)

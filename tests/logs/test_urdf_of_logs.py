@@ -3,8 +3,11 @@
 import math
 
 import mujoco
+import pytest
 
 from bayessim_mjx import import_logs
+from bayessim_mjx.diagnosis.fitting import robot
+from bayessim_mjx.errors import UserError
 
 URDF = """<robot name="r"><link name="base"/>
 <link name="arm"><inertial><origin xyz="0 0 -0.1"/><mass value="0.5"/>
@@ -29,3 +32,9 @@ def test_a_check_names_drives_and_carries_them_on(tmp_path, capsys):
     assert "allowed: --drive torque" in capsys.readouterr().err
     assert import_logs.main([*given, "--drive", "torque"]) == 0
     assert f"--model {model} --drive torque --data {logs}" in capsys.readouterr().out
+
+
+def test_a_folder_in_the_place_of_a_model_is_said(tmp_path):
+    (tmp_path / "logs").mkdir()
+    with pytest.raises(UserError, match="a folder; give the file in it"):
+        robot.names_of(tmp_path / "logs")

@@ -1,6 +1,8 @@
 """Figures of the page whose numbers could make them unreadable."""
 
-from bayessim_mjx.report import gap_figures, rival_figures
+import pytest
+
+from bayessim_mjx.report import evidence, gap_figures, rival_figures
 from bayessim_mjx.report.look import COLUMN
 
 STAGES = {"nominal": 4.0, "calibrated": 2.0, "with_effects": 1.0, "noise_floor": 1.0}
@@ -30,3 +32,10 @@ def test_the_waterfall_fits_a_phone():
     assert drawn["least"] <= 332 and names[0] == "as delivered" and len(names) == len(drawn["data"][0]["y"])
     assert all(len(line) <= 24 for name in names for line in name.split("<br>"))
     assert all(t["orientation"] == "h" for t in drawn["data"] if t["type"] == "bar")
+
+
+def test_estimates_per_condition_are_drawn_about_the_tables_value():
+    """Conditions at .98 and 1.02 about the simulated 1.0 lie at 1.08 and 1.12 about the robot's 1.1."""
+    moved = evidence._of_robot({"mean": [0.98, 1.02], "sd": [0.1, 0.1]}, {"mean": 1.1, "simulated": 1.0})
+    assert moved["mean"] == pytest.approx([1.08, 1.12]) and moved["sd"] == [0.1, 0.1]
+    assert evidence._of_robot({"mean": [0.98]}, {"mean": 1.1})["mean"] == [0.98]

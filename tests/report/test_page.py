@@ -303,3 +303,12 @@ def test_a_robot_of_one_joint_has_no_table_of_shares(tmp_path):
     whole = fake.full()
     page = rendered(dataclasses.replace(whole, where=whole.where[:1]), tmp_path)
     assert f"All of it is at {whole.where[0].channel}" in page.text and "share of the squared gap" not in page.text
+
+
+@pytest.mark.parametrize(("own", "said"), [(0.002, True), (0.0005, False)])
+def test_the_page_has_the_time_step_of_the_errors_and_what_was_stated(own, said, tmp_path):
+    """A model whose own step is coarser has a larger error than the one that is reported."""
+    about = {"timestep": 5e-4, "integrator": "IMPLICITFAST", "model_timestep": own, "stated": {"accuracy": ["5%"]}}
+    text = rendered(dataclasses.replace(fake.full(), about=about), tmp_path).text
+    assert "Errors at time steps of 0.5" in text and "(IMPLICITFAST)" in text and "--accuracy 5%" in text
+    assert ("model_with_effects.xml steps 2" in text) == said

@@ -169,6 +169,11 @@ def command(d: Diagnosis, folder: str | Path) -> str:
     return shlex.join(said)
 
 
+def purpose(pasted: str) -> str:
+    """Return what a command to paste is for: a viewer trains nothing."""
+    return "view it" if "mujoco.viewer" in pasted else "next"
+
+
 # The next experiment in words: its motion, what it separates or measures better, and what else would help
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from bayessim_mjx import versions
@@ -57,6 +58,12 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
     more |= {"maps": where.found.maps, "frequency": [heard.details() for heard in where.spectra]} if where else {}
     more |= {"experiments": proposal.details()} if proposal else {}
     experiment = proposal.to_dict(file) if proposal else {}
+    cut, own_model = setup.fitter.simulator.windows, setup.physics.mj_model
+    simulated = {
+        "conditions": cut.conditions,
+        "timestep": cut.dt / cut.batch.command.shape[2],
+        "integrator": mujoco.mjtIntegrator(own_model.opt.integrator).name.removeprefix("mjINT_"),
+    }
     result = Diagnosis(
         verdict=verdict.name,
         sentences=[],
@@ -71,7 +78,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         details=details(found) | more,
         covariance={"names": list(model.fit.names), "matrix": together},
         not_fitted=not_fitted(selection.state),
-        about={**about, "conditions": setup.fitter.simulator.windows.conditions} if about else {},
+        about={**about, **simulated} if about else {},
         hidden=list(selection.hidden),
         accuracy=estimates.accuracy(model, own.sheet),
         evidence=selection.weighed.to_dicts(),

@@ -295,13 +295,25 @@ def _at_home(spec: mujoco.MjSpec, folder: str) -> mujoco.MjSpec:
     return spec
 
 
-def header(robot: Robot, model: Source, logs: Sequence[str | Path | Log], recorded: Sequence[Log]) -> dict[str, Any]:
-    """Return entries of the report's header."""
+def header(
+    robot: Robot,
+    model: Source,
+    logs: Sequence[str | Path | Log],
+    recorded: Sequence[Log],
+    stated: Sequence[Sequence[str]] = ((), (), ()),
+) -> dict[str, Any]:
+    """Return entries of the report's header.
+
+    Args:
+        stated: texts of --accuracy, --payload and --tolerance.
+    """
     return {
         "robot": robot.name,
         "model": str(model) if isinstance(model, str | Path) else robot.name,
         "data": [log.name if isinstance(log, Log) else str(log) for log in logs],
         "logs": len(recorded),
         "seconds": float(sum(log.duration for log in recorded)),
+        "stated": dict(zip(("accuracy", "payload", "tolerance"), map(list, stated), strict=True)),
+        "model_timestep": float(robot.mj_model.opt.timestep),
         "date": time.strftime("%Y-%m-%d %H:%M"),
     }

@@ -27,7 +27,10 @@ from bayessim_mjx.parameters.reading import own_value
 if TYPE_CHECKING:
     import mujoco
 
-HEADER = "# What a diagnosis found. Use: bayessim-mjx main --task T effects={name}{code}\n"
+HEADER = (
+    "# What a diagnosis found. Use: bayessim-mjx main --task T effects={name}{code}\n"
+    "# Calibrated numbers fit at the simulator's time step; the report's table and picture have those of the robot.\n"
+)
 LEAST_SD = 1e-6  # of the range
 SURE = 3.0  # sd that a task's range is widened to hold
 _FIELDS = [f.name for f in dataclasses.fields(Parameter) if f.name != "schedule"]

@@ -178,6 +178,11 @@ def test_the_command_can_be_pasted(name, effects, about, experiment, words):
     assert advice.command(found, "found") == words == shlex.join(shlex.split(words))
 
 
+def test_a_viewer_is_no_training():
+    assert advice.purpose("python -m mujoco.viewer --mjcf=found/a.xml") == "view it"
+    assert advice.purpose("bayessim-mjx train --task Pendulum") == "next"
+
+
 def test_a_model_for_mujoco_that_lacks_an_effect_is_not_advised():
     """Nor shown by the command: what it lacks may be most of what was found."""
     found = dataclasses.replace(made("effects", [FRICTION]), about=ABOUT | {"model": "arm.xml"})
