@@ -160,7 +160,7 @@ FAULTS: tuple[tuple[str, str, str, str, tuple[str, ...]], ...] = (
     # diagnosis
     (
         "superfluous effects stay in the answer", f"{P}/diagnosis/evidence/weighing.py",
-        "limit = excess[key] +", "limit = 0.0 * excess[key] - 1.0 +", (SETS,),
+        "limit, unlikely = left[key].excess + _relevant(left),", "limit, unlikely = -1.0,", (SETS,),
     ),
     (
         "noise is not taken out before the tolerance", f"{P}/diagnosis/statistics.py",

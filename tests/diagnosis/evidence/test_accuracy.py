@@ -43,7 +43,7 @@ def test_one_number_against_quadrature(seen, sd):
     exact = [grid[np.searchsorted(below, p)] for p in (0.05, 0.5, 0.95)]
     mode = grid[np.argmax(PRIOR.logpdf(grid - 1) + stats.norm(seen, sd).logpdf(grid))]
     fit = fitted([mode], ["mass"])
-    fit = SimpleNamespace(coordinates=fit.coordinates, values=fit.values)
+    fit = SimpleNamespace(coordinates=fit.coordinates, values=fit.values, away=fit.away)
     fit.belief = lambda: np.array([(seen - mode) / sd**2 / (mode - 1)])  # at the mode: prior and data in balance
     found = parameters.posterior(fit, np.array([[sd**-2]])).quantiles()[:, 0]
     assert found == pytest.approx(exact, abs=0.06 * (exact[2] - exact[0]))

@@ -19,9 +19,11 @@ def test_a_share_that_reaches_no_joint_is_said_to_be_unidentified(monkeypatch, d
     coordinates = [SimpleNamespace(name=n, low=-1.0, high=1.0, unit="", neutral=0.0) for n in names]
     shapes = np.zeros(2, bool)
     effect = SimpleNamespace(effect="effort_coupling", where="waist", coordinates=coordinates, label="x", shapes=shapes)
-    fit = SimpleNamespace(names=list(names), values=np.array([-0.027, 0.0]))
+    fit = SimpleNamespace(names=list(names), values=np.array([-0.027, 0.0]), coordinates=coordinates)
     model = SimpleNamespace(fit=fit, effects=(effect,))
-    found = SimpleNamespace(setup=SimpleNamespace(physics=None), model=model, selection=SimpleNamespace(rivals={}))
+    fitter = SimpleNamespace(simulator=SimpleNamespace(windows=SimpleNamespace(dt=0.01)))
+    setup = SimpleNamespace(physics=None, fitter=fitter)
+    found = SimpleNamespace(setup=setup, model=model, selection=SimpleNamespace(rivals={}))
     monkeypatch.setattr(estimates.bounds, "of", lambda physics, coordinate, value: None)
     monkeypatch.setattr(estimates, "_unit", lambda setup, effect, unit: unit)
     part = {"share": 1.0, "gap_closed": 1.0, "gap_closed_ci": (0.9, 1.0), "predicted_gap_closed": 1.0}
