@@ -204,9 +204,13 @@ def _checked(args: argparse.Namespace) -> int:
         print(found.end)
     if not found.faults:
         own = cli.urdf_words(args.drive, args.packages)
-        print(
-            " ".join(["nothing is missing; next: bayessim-mjx diagnose --model", args.model, *own, "--data", str(path)])
-        )
+        first = "nothing is missing; next:"
+        if found.doubts:
+            first = (
+                f"no channel is missing, but {count(len(found.doubts), 'note')} above may have its cause in the map; "
+            )
+            first += "check it, then:"
+        print(" ".join([first, "bayessim-mjx diagnose --model", args.model, *own, "--data", str(path)]))
     return 2 if found.faults else 0
 
 
@@ -231,6 +235,7 @@ def _gated(args: argparse.Namespace, found: "Overview") -> None:
         found.end = f"{len(said.refused)} of {of} refused: {shown}; mend the map or the log, or take the file away"
     elif lacking := cutting.too_few(said.usable, period):
         found.refused.append(lacking)
+    found.doubts += said.doubts
     found.notes += [text for text in (*said.doubts, *said.findings) if text not in found.notes]
 
 

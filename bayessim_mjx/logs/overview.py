@@ -50,7 +50,8 @@ class Overview:
         missing: channels that the logs need; refused: why they cannot be read. Both have to be mended.
         map_text: the map that was proposed, "" where there is one.
         logs: as a diagnosis reads them, where nothing has to be mended.
-        end: the last line, of how many logs are refused. layouts: the different columns of the files.
+        doubts: of the notes those that a wrong map may explain; end: the last line, of how many logs are refused.
+        layouts: the different columns of the files.
     """
 
     columns: list[tuple[str, ...]] = field(default_factory=list)
@@ -58,6 +59,7 @@ class Overview:
     notes: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
     map_text: str = ""
     logs: list[Log] = field(default_factory=list)
     end: str = ""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bayessim_mjx import import_logs
+from bayessim_mjx.diagnosis.logcheck import gate
 from bayessim_mjx.logs import read_logs
 from bayessim_mjx.logs.names import parts
 from bayessim_mjx.logs.proposal import propose
@@ -263,3 +264,16 @@ def test_a_log_that_a_diagnosis_leaves_out_is_the_last_word(tmp_path: Path, caps
     code, out = check(capsys, folder, "--model", model_of(tmp_path))
     assert code == 2 and "refused: wrong.csv: effort unrelated" in out and "nothing is missing" not in out
     assert out.splitlines()[-1].startswith("1 of 2 logs refused: wrong.csv;")
+
+
+def test_a_log_that_is_doubted_is_not_passed_without_a_word(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The gate takes it, and so does the check; its last line sends the reader to the map."""
+    monkeypatch.setattr(gate.Gate, "doubts", ("are the columns swapped?",))
+    code, out = check(capsys, logs_of(tmp_path, moved(), HEADER), "--model", model_of(tmp_path))
+    last = out.splitlines()[-1]
+    assert code == 0 and "note: are the columns swapped?" in out
+    assert last.startswith("no channel is missing; check the map against 1 note above, then: bayessim-mjx diagnose"), (
+        last
+    )
