@@ -206,10 +206,7 @@ def _checked(args: argparse.Namespace) -> int:
         own = cli.urdf_words(args.drive, args.packages)
         first = "nothing is missing; next:"
         if found.doubts:
-            first = (
-                f"no channel is missing, but {count(len(found.doubts), 'note')} above may have its cause in the map; "
-            )
-            first += "check it, then:"
+            first = f"no channel is missing; check the map against {count(len(found.doubts), 'note')} above, then:"
         print(" ".join([first, "bayessim-mjx diagnose --model", args.model, *own, "--data", str(path)]))
     return 2 if found.faults else 0
 
