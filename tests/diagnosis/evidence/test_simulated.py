@@ -56,7 +56,7 @@ def _sampled(found, key):
     own = len(fixed.values)
     precision, neutral = precision[:own], neutral[:own]
     covariance = np.linalg.inv(learnt.Q[1:, 1:] + np.diag(fit.belief()))[:own, :own]
-    rng, draws = np.random.default_rng(0), 200
+    rng, draws = np.random.default_rng(0), 400
 
     def log_density(p):
         theta = fitter.vector(fixed.coordinates, fixed.values + p)
