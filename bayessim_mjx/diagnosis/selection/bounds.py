@@ -157,10 +157,13 @@ def _adopt(state: SearchState, new: Model) -> None:
     state.screened = [replace(s, candidate=own.get(s.candidate.label, s.candidate)) for s in state.screened]
 
 
-def spread_out(covariance: np.ndarray, values: np.ndarray, neutral: np.ndarray, at: Sequence[int]) -> np.ndarray:
-    """Return a covariance `[k, k]` that says of the parameters `at` a bound no more than that they are not neutral."""
+def spread_out(covariance: np.ndarray, away: np.ndarray, at: Sequence[int]) -> np.ndarray:
+    """Return a covariance `[k, k]` that says of the parameters `at` a bound no more than that they are not neutral.
+
+    away: `[k]`, their distance from neutral.
+    """
     out = covariance.copy()
     for i in at:
         out[i, :] = out[:, i] = 0.0
-        out[i, i] = (0.5 * (values[i] - neutral[i])) ** 2
+        out[i, i] = (0.5 * away[i]) ** 2
     return out

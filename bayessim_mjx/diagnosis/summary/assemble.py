@@ -119,8 +119,7 @@ def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
         for c, value in zip(effect.coordinates, model.values_of(effect), strict=True):
             bound = bounds.of(physics, c, float(value))
             at += [model.fit.names.index(c.name)] if bound is not None and bound.kind != "off" else []
-    neutral = np.array([c.neutral for c in model.fit.coordinates])
-    return bounds.spread_out(covariance, model.fit.values, neutral, at)
+    return bounds.spread_out(covariance, model.fit.away, at)
 
 
 def ranking(state: SearchState) -> list[dict[str, Any]]:

@@ -128,5 +128,5 @@ def test_a_value_at_a_bound_is_no_interval():
     assert words.quantity("mass", Estimate(33.0, nan, "kg", "at least")) == ("mass", "at least 33.0 kg")
     assert words.quantity("inverse_limit", Estimate(2.0, nan, "1/(N m)", "at least"))[1] == "at most 0.500 N m"
     assert words.quantity("excess", Estimate(0.0, 0.01, "N m", "off"))[1].endswith("(off)")
-    spread = bounds.spread_out(np.ones((2, 2)), np.array([3.0, 1.0]), np.zeros(2), [0])
+    spread = bounds.spread_out(np.ones((2, 2)), np.array([3.0, 1.0]), [0])
     assert spread.tolist() == [[1.5**2, 0.0], [0.0, 1.0]]
