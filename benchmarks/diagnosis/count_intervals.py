@@ -2,7 +2,7 @@
 
     python benchmarks/diagnosis/count_intervals.py run OUT --workers 64 --minutes 9 [--only sheets] [--shard 0/2]
     python benchmarks/diagnosis/count_intervals.py isolable OUT --workers 64 --minutes 9   # needs no result
-    python benchmarks/diagnosis/count_intervals.py isolable OUT --case pendulum_single_s9300
+    python benchmarks/diagnosis/count_intervals.py keep OUT                               # what was found, for `score`
     python benchmarks/diagnosis/count_intervals.py score OUT [--before OTHER]
 
 `counted_cases.py` fixes the cases: 150 of data sheets, 60 of poor logs, 90 outside the library, and 60 in each of two
@@ -23,7 +23,7 @@ other realities. Rules, fixed before any case was diagnosed:
 - **Isolable** is a case if, by its truth alone, every other cause of the generator leaves something of each hidden
   effect, and known parameters do that are free within 90 % of their nominal values (`lookalikes.py`; no accuracy is
   stated). An effect that is a known parameter by another name (viscous friction, armature) never is. One process
-  examines one case; OUT/CASE/isolable.json keeps what it found.
+  examines one case into OUT/CASE/isolable.json; `keep` adds them to isolable.json here, which `score` reads.
 - **Strengths.** Parameters of rightly named effects, where they mean the same in reality and library (not those of base
   flexibility, external force and load friction). An interval is mean +- 1.645 sd. A parameter at a bound or without sd
   is a miss, unless it says "at least" or "at most" and that holds.
@@ -229,6 +229,7 @@ def _parser() -> argparse.ArgumentParser:
         single = commands.add_parser(name, help="one case in this process")
         single.add_argument("folder", type=Path)
         single.add_argument("--more", default="")
+    commands.add_parser("keep", help="add what was found of rivals to isolable.json").add_argument("out", type=Path)
     table = commands.add_parser("score", help="tables of what came of all cases")
     table.add_argument("out", type=Path)
     table.add_argument("--before", type=Path, help="the same cases by another commit")
@@ -239,6 +240,10 @@ def main() -> None:
     args = _parser().parse_args()
     if args.does in ONE:
         run(args)
+    elif args.does == "keep":
+        from counted_cases import keep
+
+        print(f"{keep(args.out)} cases are examined")
     elif args.does == "score":
         from counted_tables import tables
 

@@ -39,6 +39,7 @@ logs, one null and one unknown cause. `frozen.json` has what a commit said of th
 import dataclasses
 import functools
 import itertools
+import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -77,6 +78,7 @@ POOR_SEED = 9400
 TURNS = ("pendulum", "cartpole", "two_link", "leg") * 2 + ("arm_servo", "arm_torque")
 HELD_TURNS = ("two_link", "leg") * 4 + ("arm_torque",) * 2
 HELD = {"two_link": ("elbow", 4000, 40), "leg": ("knee", 4000, 40), "arm_torque": ("flange", 2000, 20)}  # joint, kp, kv
+EXAMINED = Path(__file__).with_name("isolable.json")
 COUNT = 2 * np.pi / 4096  # rad, of the held joint's encoder
 CHOSEN = range(2, 7)  # runs of which few are logged: none is slow or without a controller
 STEPS = 4.0  # standard deviations of noise, of quantised encoders
@@ -284,6 +286,23 @@ def rivals_of(plan: Plan, truth: dict[str, Any] | None = None) -> list[dict[str,
 def each_isolable(found: Sequence[dict[str, Any]]) -> bool:
     """Whether known parameters leave something of each hidden effect, and every rival of it does."""
     return all(f["left"] >= APART and isolable(f["rivals"], f["left"]) for f in found)
+
+
+@functools.cache
+def examined() -> dict[str, list[dict[str, Any]]]:
+    """What `rivals_of` found of each case, with the closest rival alone: a case is the same for every commit."""
+    return dict(json.loads(EXAMINED.read_text()))
+
+
+def keep(out: Path) -> int:
+    """Add the cases that were examined in a folder to those of `examined`, one case a line; how many there are."""
+    own = {f.parent.name: json.loads(f.read_text()) for f in out.glob(f"*/{EXAMINED.name}")}
+    closest = {name: [f | {"rivals": f["rivals"][:1]} for f in found] for name, found in own.items()}
+    every = (examined() if EXAMINED.exists() else {}) | closest
+    rounded = {n: json.loads(json.dumps(f), parse_float=lambda x: round(float(x), 3)) for n, f in sorted(every.items())}
+    lines = ",\n".join(f" {json.dumps(name)}: {json.dumps(found)}" for name, found in rounded.items())
+    EXAMINED.write_text(f"{{\n{lines}\n}}\n")
+    return len(every)
 
 
 def logged(plan: Plan, robot: System, runs: Sequence[Run], rng: np.random.Generator) -> list[Run]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from counted_cases import OTHERS, POOR, SEEDS, Plan, each_isolable, plans
+from counted_cases import OTHERS, POOR, SEEDS, Plan, each_isolable, examined, plans
 from score import Outcome, label, mcnemar
 
 from bayessim_mjx.blind.outcome import LOOSE, alarm, covered, holds, labels_of, wilson
@@ -68,8 +68,8 @@ def answer(plan: Plan, folder: Path) -> Answer:
     untold += missing + more + [f"loose: {e['name']}" for e in o.truth["effects"] if e["name"] in LOOSE]
     state = "no result" if said is None else "ended"
     members = len(o.members()) if o.named() else math.nan
-    apart = folder / "isolable.json"
-    alone = each_isolable(json.loads(apart.read_text())) if apart.exists() else None
+    apart = examined().get(plan.name)
+    alone = None if apart is None else each_isolable(apart)
     cpu = result.get("cpu", math.nan)
     return Answer(plan, state, rates, members, tuple(untold), cpu, label(o), stated(o), alone)
 
@@ -143,13 +143,17 @@ def tables(out: Path, before: Path | None = None) -> str:
         (f"{k}, {'' if own else 'not '}isolable", lambda a, k=k, own=own: a.plan.kind == k and a.isolable is own)
         for k in ("single", "double") for own in (True, False)
     ]  # fmt: skip
+    apart: list[Group] = [
+        (f"{r}, {k}, isolable", lambda a, r=r, k=k: a.plan.reality == r and a.plan.kind == k and a.isolable is True)
+        for r in REALITIES for k in ("single", "double")
+    ]  # fmt: skip
     by_logs: list[Group] = [(k, lambda a, k=k: a.plan.logs == k) for k in POOR]
     text = [
         f"Data sheets of any accuracy\n\n{_table(sheets, [*by_kind, *examined, *by_system])}",
         f"By the scale of the true errors\n\n{_table(sheets, by_error)}",
         f"Few and poor logs\n\n{_table(logs, [*by_logs, *examined[:2]])}",
         f"Nothing of the library\n\n{_outside(outside, by_system)}",
-        f"Data sheets of any accuracy, by reality\n\n{_table(_of(every, 'sheets'), by_reality)}",
+        f"Data sheets of any accuracy, by reality\n\n{_table(_of(every, 'sheets'), [*by_reality, *apart])}",
         f"Nothing of the library, by reality\n\n{_outside(_of(every, 'outside'), by_reality)}",
         f"Stated probabilities\n\n{_stated(every)}",
         _left_out(every),
