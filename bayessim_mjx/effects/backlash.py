@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support import transmission
 from bayessim_mjx.effects.support.quantity import LINK_ENCODER
-from bayessim_mjx.effects.support.site import Site
+from bayessim_mjx.effects.support.site import Site, staggered
 from bayessim_mjx.effects.support.substep import SubStep
 
 RATIO = 0.7  # damping of the teeth, of critical: "teeth do not bounce"; not counted
@@ -49,14 +49,17 @@ class Backlash(transmission.OfTransmission, Effect):
         both = transmission.sides(at, memory, step, on, self.mark)
         none = jnp.zeros(len(at))
         soft = at.values(theta)[:, 1] if TEETH in self.quantities else none
-        teeth = transmission.sprung(both, step.dt, jnp.where(fresh, 0.0, soft), RATIO)
+        teeth = transmission.sprung(at, both, step.dt, jnp.where(fresh, 0.0, soft), RATIO)
 
         def solve(side: jax.Array) -> transmission.Passed:
             rest = jnp.where(fresh, 0.0, gap * side)
-            return transmission.transmit(both, step.dt, *teeth, rest, on & (fresh | (side != 0)))
+            return transmission.transmit(both, step.dt, teeth, rest, on & (fresh | (side != 0)))
 
-        twist = both.twist + step.dt * solve(none).slip  # if nothing touched
+        free = none + (1.0 if staggered(at.mj_model) else 0.5)
+        way = (1.0 - free) * both.slip + free * solve(none).slip
+        twist = both.twist + step.dt * way  # if nothing touched
         side = jnp.where(jnp.abs(twist) > gap, jnp.sign(twist), 0.0)
-        passed = solve(jnp.where(solve(side).torque * side > 0, side, 0.0))
+        side = jnp.where(solve(side).torque * side > 0, side, 0.0)
+        passed, share = solve(side), jnp.where(fresh | (side != 0), teeth.share, free)
         twist = jnp.where(fresh, gap * jnp.sign(passed.torque) + soft * passed.torque, both.twist)
-        return transmission.finish(at, memory, step, both, passed, twist, self.encoder(at, theta))
+        return transmission.finish(at, memory, step, both, passed, twist, share, self.encoder(at, theta))

@@ -11,7 +11,7 @@ import numpy as np
 from bayessim_mjx.effects.effect import Effect, Quantity
 from bayessim_mjx.effects.support.bodies import moved, tilted
 from bayessim_mjx.effects.support.motion import Motion
-from bayessim_mjx.effects.support.site import Site, find, joint_dofs
+from bayessim_mjx.effects.support.site import Site, find, joint_dofs, staggered
 from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.errors import UserError
 
@@ -61,7 +61,8 @@ class BaseFlexibility(Effect):
 
     def init(self, at: Site) -> Any:
         yes, no = jnp.ones((), bool), jnp.zeros((), bool)
-        return {"tilt": jnp.zeros(2), "rate": jnp.zeros(2), "fresh": yes, "moving": no}
+        none = jnp.zeros(2)
+        return {"tilt": none, "rate": none, "acceleration": none, "fresh": yes, "moving": no}
 
     def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:
         return memory | {"moving": jnp.ones((), bool)}, motion  # how it rocks is not known: as it is pushed just then
@@ -76,13 +77,19 @@ class BaseFlexibility(Effect):
         carried, moment = robot.pushed(tilt, step.force)
         # a resolved spring is looked at where the sub-step begins, which costs no energy; a stiff one where it ends
         late = lag + dt * jnp.maximum(1.0 - (slow / dt) ** 2, 0.0)
+        if not staggered(at.mj_model):  # RK4 moves the base; it is stable where its stages resolve the base alone
+            late, slow, dt = lag, jnp.maximum(slow, dt), 0.0
         # Schur complement of the robot; all times 1/k
         matrix = compliance * (robot.inertia - robot.shed @ robot.coupling.T) + (slow**2 + dt * late) * jnp.eye(2)
         acceleration = _solve(matrix, compliance * moment - tilt - late * rate)
         new = jnp.clip(tilt + dt * (rate + dt * acceleration), -STOP, STOP)
+        rate = jnp.where(jnp.abs(new) < STOP, rate + dt * acceleration, 0.0)
         no = jnp.zeros((), bool)
-        left = {"tilt": new, "rate": (new - tilt) / dt, "fresh": no, "moving": no}
+        left = {"tilt": new, "rate": rate, "acceleration": acceleration, "fresh": no, "moving": no}
         return left, jnp.where(compliance > 0, carried - robot.coupling.T @ acceleration, 0.0)
+
+    def rates(self, at: Site, memory: Any) -> dict[str, jax.Array]:
+        return {"tilt": memory["rate"], "rate": memory["acceleration"]}
 
     def edit(self, spec: mujoco.MjSpec, values: dict[str, dict[str, float]]) -> str | None:
         return "MuJoCo needs two joints more under the robot, which changes qpos and qvel; use effects.yaml"

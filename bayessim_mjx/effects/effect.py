@@ -224,6 +224,15 @@ class Effect(abc.ABC):
         """
         return jnp.zeros(at.nv, bool)
 
+    def rates(self, at: Site, memory: Any) -> dict[str, jax.Array]:
+        """Rates of those entries of the memory that an integrator of several stages (RK4) moves, as `on_force` left it.
+
+        An effect that has this hook exerts the force of each stage, in place of one that is held over the sub-step:
+        `on_force` is called in every stage with the memory moved so far, and itself moves none of these entries. None
+        of them ({}): the force depends on the state alone. Other integrators do not call it.
+        """
+        return {}
+
     def on_measurement(
         self, at: Site, memory: Any, measurement: Measurement, theta: jax.Array
     ) -> tuple[Any, Measurement]:

@@ -49,5 +49,8 @@ class ExternalForce(Effect):
         force = jnp.where((slowness > 0) & (square > 0), wind, still)
         return memory, project(at.mj_model, step.data, at.ids, force)
 
+    def rates(self, at: Site, memory: Any) -> dict[str, jax.Array]:
+        return {}
+
     def edit(self, spec: "mujoco.MjSpec", values: dict[str, dict[str, float]]) -> str | None:
         return "MuJoCo applies forces to bodies at run time (xfrc_applied), not in the model; use effects.yaml"

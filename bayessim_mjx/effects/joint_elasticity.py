@@ -47,7 +47,7 @@ class JointElasticity(transmission.OfTransmission, Effect):
         both = transmission.sides(at, memory, step, on, self.mark)
         compliance, ratio, *_ = at.values(theta).T
         soft = jnp.where(on & ~memory["fresh"], compliance, 0.0)
-        spring = transmission.sprung(both, step.dt, soft, ratio)
-        passed = transmission.transmit(both, step.dt, *spring, jnp.zeros(len(at)), on)
+        spring = transmission.sprung(at, both, step.dt, soft, ratio)
+        passed = transmission.transmit(both, step.dt, spring, jnp.zeros(len(at)), on)
         twist = jnp.where(memory["fresh"], compliance * passed.torque, both.twist)
-        return transmission.finish(at, memory, step, both, passed, twist, self.encoder(at, theta))
+        return transmission.finish(at, memory, step, both, passed, twist, spring.share, self.encoder(at, theta))

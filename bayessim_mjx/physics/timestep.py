@@ -20,6 +20,7 @@ from bayessim_mjx.physics.controllers import Drive
 from bayessim_mjx.physics.gates import chained_in
 from bayessim_mjx.physics.model import EULER, IMPLICITFAST, RK4, Physics
 from bayessim_mjx.physics.pushed import Memory, pushed
+from bayessim_mjx.physics.staged import Staged
 
 # of RK4 after the first: how far from the start, weight, and by what share of a command's slope over the timestep its
 # command is another than the mean: so positions and velocities move as by the slope, and the first stage has the mean
@@ -92,7 +93,7 @@ def substep(
     else:
         own, memory = Timestep(physics, model, thetas, seen, drive, slope), carry[0]
         data, carry, step = forward(own, data, carry)
-        data = _integrated(own, data, memory, step)
+        data, carry = _integrated(own, data, memory, carry, step)
     if physics.max_qvel is not None:
         data = data.replace(qvel=jnp.clip(data.qvel, -physics.max_qvel, physics.max_qvel))
     return data, carry
@@ -229,13 +230,13 @@ def _response(own: Timestep, plain: mjx.Data, acting: jax.Array, memory: tuple) 
     return response * jnp.where(dof >= 0, ((torque > low) & (torque < high))[dof], True)
 
 
-def _integrated(own: Timestep, data: mjx.Data, memory: tuple, step: SubStep) -> mjx.Data:
+def _integrated(own: Timestep, data: mjx.Data, memory: tuple, carry: Memory, step: SubStep) -> tuple[mjx.Data, Memory]:
     """Return the state at the end of the timestep; memory: of the effects, as it was at its beginning."""
     integrator = int(own.physics.mj_model.opt.integrator)
     if integrator == RK4:
-        return _rk4(own, data, memory)
+        return _rk4(own, data, memory, carry)
     data = _in_turn(data)
-    return mjx.euler(own.model, data) if integrator == EULER else mjx.implicit(step.solved, data)
+    return mjx.euler(own.model, data) if integrator == EULER else mjx.implicit(step.solved, data), carry
 
 
 def _in_turn(data: mjx.Data) -> mjx.Data:
@@ -255,22 +256,24 @@ def _inside(own: Timestep, ctrl: jax.Array, slope: jax.Array) -> jax.Array:
     return jnp.clip(slope, jnp.maximum(down, -4 * up), jnp.minimum(up, -4 * down))
 
 
-def _rk4(own: Timestep, first: mjx.Data, memory: tuple) -> mjx.Data:
+def _rk4(own: Timestep, first: mjx.Data, memory: tuple, carry: Memory) -> tuple[mjx.Data, Memory]:
     """Return the classical Runge-Kutta method of fourth order, from its first stage.
 
     Actuators' forces are corrected in every stage, from the same memory: what effects remember is of the first one.
     Held over the timestep are the controller's output (but for the slope of commands), the effects' own forces (their
-    friction is that of its end already) and the torque of actuators that act through an effect (`Effect.transmits`).
+    friction is that of its end already) unless they have `rates`, and the torque of actuators that act through an
+    effect (`Effect.transmits`).
     """
     model, dt = own.model, own.model.opt.timestep
     slope_of_ctrl = None if own.slope is None else _inside(own, first.ctrl, own.slope)
     flags = mjx.DisableBit(int(model.opt.disableflags) | _NO_DAMPING)
+    staged = Staged(own, first, carry)
 
-    def moved(slope: tuple[jax.Array, ...], time: jax.Array) -> mjx.Data:
+    def moved(slope: tuple[Any, ...], time: jax.Array) -> mjx.Data:
         """`time` after the beginning, at this velocity and rate of the activations; qvel is not moved."""
         # MJX's own steps, quaternions and activations come with Euler's method: at no acceleration it goes along qvel
         straight = model.tree_replace({"opt.timestep": time, "opt.disableflags": flags})
-        velocity, acceleration, rate = slope
+        velocity, acceleration, rate, _ = slope
         along = first.replace(qvel=velocity, qacc=jnp.zeros_like(acceleration), act_dot=rate)
         return mjx.euler(straight, along)
 
@@ -286,13 +289,15 @@ def _rk4(own: Timestep, first: mjx.Data, memory: tuple) -> mjx.Data:
         for _, effect, at, theta in own.having("transmits"):
             torque = jnp.where(effect.transmits(at, theta), first.qfrc_actuator, data.qfrc_actuator)
             data = data.replace(qfrc_actuator=torque)
+        data, rates = staged.pushed(data, slope[3], time)
         data = _accelerated(model, data)
-        slope = (qvel, data.qacc, data.act_dot)
+        slope = (qvel, data.qacc, data.act_dot, rates)
         return (jax.tree.map(lambda t, s: t + row[1] * s, total, slope), slope), None
 
-    start = (first.qvel, first.qacc, first.act_dot)
+    start = (first.qvel, first.qacc, first.act_dot, staged.first)
     total, last = jax.lax.scan(stage, (jax.tree.map(lambda x: x / 6, start), start), jnp.asarray(STAGES))[0]
     end = moved(total, dt)
-    return first.replace(
+    data = first.replace(
         qpos=end.qpos, qvel=first.qvel + dt * total[1], act=end.act, time=end.time, qacc_warmstart=last[1]
     )
+    return data, (staged.memory(total[3], dt), carry[1])

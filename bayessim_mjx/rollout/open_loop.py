@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.compat import brief
-from bayessim_mjx.effects.support.motion import AROUND, Motion
+from bayessim_mjx.effects.support.motion import AROUND, PAST, Motion
 from bayessim_mjx.physics import Drive, Physics, control_step, retraced
 from bayessim_mjx.physics.controllers import Law
 
@@ -106,4 +106,5 @@ def recording(physics: Physics, qpos: jax.Array, qvel: jax.Array, command: jax.A
 def remembered(physics: Physics) -> int:
     """Control steps of a recording around a start that the effects look at: three of their longest times."""
     times = [p.high for effect in physics.effects for p in effect.space().parameters if p.unit == "s"]
-    return max(2, math.ceil(max([AROUND, *(3 * t for t in times)]) / physics.dt - 1e-6)) if physics.effects else 0
+    least = PAST if any(effect.follows for effect in physics.effects) else AROUND
+    return max(2, math.ceil(max([least, *(3 * t for t in times)]) / physics.dt - 1e-6)) if physics.effects else 0

@@ -13,7 +13,7 @@ from flax import struct
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.logcheck.noise import noise_of
-from bayessim_mjx.effects.support.motion import AROUND, Motion
+from bayessim_mjx.effects.support.motion import PAST, Motion
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import around as rows_around
@@ -179,7 +179,7 @@ def _batch(
 
 def _past(dt: float) -> int:
     """Rows around a start that effects with memory look at."""
-    return max(2, int(np.ceil(AROUND / dt)))
+    return max(2, int(np.ceil(PAST / dt)))
 
 
 def _starts(

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from bayessim_mjx.effects.support.quantity import Quantity
-from bayessim_mjx.effects.support.site import Site, joint_dofs, ranges
+from bayessim_mjx.effects.support.site import Site, joint_dofs, ranges, staggered
 from bayessim_mjx.effects.support.substep import SubStep
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ Measurement: TypeAlias = dict[str, jax.Array]  # {"qpos": [nq], "qvel": [nv]}
 SHARE = 0.2  # of the joint's inertia is the motor's where the model has no armature
 REAL = 2.0**-10  # armature below this part of the joint's inertia counts as none
 _EULER = int(mujoco.mjtIntegrator.mjINT_EULER)
-_IMPLICIT, _RK4 = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST), int(mujoco.mjtIntegrator.mjINT_RK4)
+_IMPLICIT = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
 
 
 def start(at: Site) -> dict[str, jax.Array]:
@@ -52,7 +52,8 @@ def split(at: Site, model: "mjx.Model", on: jax.Array, mark: float) -> "mjx.Mode
 def follow(at: Site, memory: Any, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
     """(twist, slip), `[n]`: motor less link, now; the link moved as the whole simulation let it."""
     slip = jnp.where(memory["fresh"], 0.0, memory["speed"] - qvel[at.dadr])
-    return memory["twist"] + at.mj_model.opt.timestep * slip, slip
+    share = 1.0 if staggered(at.mj_model) else 0.5  # as the links move: by the new velocities, or by the mean
+    return memory["twist"] + share * at.mj_model.opt.timestep * slip, slip
 
 
 def servos(at: Site) -> tuple[np.ndarray, np.ndarray]:
@@ -71,7 +72,7 @@ def feedback(at: Site, memory: Any, step: SubStep, force: jax.Array, on: jax.Arr
     model = step.model
     twist, slip = (x[places] for x in follow(at, memory, step.qvel))
     twist = twist - memory["origin"][places]
-    if int(at.mj_model.opt.integrator) == _RK4:  # its link stands where the sub-step begins, the motor at its middle
+    if not staggered(at.mj_model):  # its link stands where the sub-step begins, the motor at its middle
         twist = twist + 0.5 * step.dt * step.qvel[at.dadr[places]]
     gear, bias = model.actuator_gear[ids, 0], model.actuator_biasprm[ids]
     extra = gear * (bias[:, 1] * twist + bias[:, 2] * slip)
@@ -103,6 +104,7 @@ class Sides(NamedTuple):
     kv: jax.Array
     inside: jax.Array
     damped: jax.Array
+    beside: jax.Array
     series: jax.Array
     inertia: jax.Array
     push: jax.Array
@@ -118,6 +120,7 @@ def sides(at: Site, memory: Any, step: SubStep, on: jax.Array, mark: float) -> S
     drag = jnp.where(on, model.dof_damping[dof], 0.0)
     servo = dt * kv if int(at.mj_model.opt.integrator) == _IMPLICIT else jnp.zeros(len(at))
     solved = servo + (dt * drag if _solves_damping(at) else 0.0)
+    damped, kv, beside = servo + dt * drag, kv + drag, jnp.zeros(len(at))
     alone = inverse(inertia - jnp.diag(solved))
     felt = 1.0 / jnp.diagonal(alone)
     part = min(SHARE, 0.8 / len(at))  # trace bound: what the motors leave stays positive definite
@@ -125,6 +128,9 @@ def sides(at: Site, memory: Any, step: SubStep, on: jax.Array, mark: float) -> S
     whole = model.dof_M0[dof]
     own = (armature > REAL * whole) & (armature < whole / REAL)
     motor, link = jnp.where(own, armature, part * felt), jnp.where(own, felt, (1 - part) * felt)
+    if not staggered(at.mj_model):  # damping at the mean speed of the sub-step, where that resolves it
+        kv = kv * (1.0 - 0.5 * jnp.minimum(1.0, motor / jnp.where(kv > 0, dt * kv, motor)))
+        damped, beside = dt * kv, 0.5 * drag
     lost = torque - drag * step.qvel[dof]
     free = step.dt * (step.inverse[dof] * (step.force - at.scatter(lost))).sum(-1)
     twist, slip = follow(at, memory, step.qvel)
@@ -137,9 +143,10 @@ def sides(at: Site, memory: Any, step: SubStep, on: jax.Array, mark: float) -> S
         lost=lost,
         motor=motor,
         kp=kp,
-        kv=kv + drag,
+        kv=kv,
         inside=jnp.where(on, solved + jnp.where(own, 0.0, motor), 0.0),
-        damped=servo + dt * drag,
+        damped=damped,
+        beside=beside,
         series=motor * link / (motor + link),
         inertia=inertia,
         push=(inertia * free).sum(-1),
@@ -209,28 +216,49 @@ class Passed(NamedTuple):
     slip: jax.Array
 
 
-def transmit(
-    both: Sides,
-    dt: float | jax.Array,
-    soft: jax.Array,
-    loss: jax.Array,
-    late: jax.Array,
-    rest: jax.Array,
-    held: jax.Array,
-) -> Passed:
-    """Solve motors and links together where `held` `[n]`; elsewhere nothing passes between them.
+class Spring(NamedTuple):
+    """s of `transmit`, `[n]` each: soft s = (twist - rest) + ahead slip + over slip', looked at in the sub-step.
 
-    soft s = (twist - rest) + (late + loss) slip', with compliance `soft` 1/k, `loss` d/k (s), `late` theta dt: where in
-    the sub-step the spring is looked at (0: its beginning, dt: its end), and slip' at the end of the sub-step.
+    slip, slip': at its beginning and end; late: the part of `over` that is way; share: of slip' in the sub-step's way.
     """
-    # motor: J (w' - w) = dt (tau - s - kp late slip' - kv (slip' - slip) - damped (v' - v) / dt)
+
+    soft: jax.Array
+    late: jax.Array
+    over: jax.Array
+    ahead: jax.Array
+    share: jax.Array
+
+
+def sprung(at: Site, both: Sides, dt: float | jax.Array, soft: jax.Array, ratio: jax.Array | float) -> Spring:
+    """Return springs of compliance `soft` 1/k `[n]`, damped by `ratio` of critical.
+
+    A resolved spring is looked at where the sub-step begins, which costs no energy. By RK4, which has a state's numbers
+    all at one time, it is looked at in the middle (implicit midpoint rule). A stiff one is looked at where it ends.
+    """
+    period = jnp.where(both.on, soft * both.series, 0.0)  # J_s / k
+    root = jnp.sqrt(jnp.where(period > 0, period, 1.0))
+    loss = jnp.where(period > 0, 2 * ratio * root, 0.0)  # d / k = 2 zeta sqrt(J_s / k)
+    squares = period / (dt**2 * (1 + period * both.kp / both.motor))
+    stiff = jnp.maximum(1.0 - squares, 0.0)
+    if staggered(at.mj_model):
+        late = dt * stiff
+        return Spring(soft, late, late + loss, jnp.zeros(len(at)), jnp.ones(len(at)))
+    share = 0.5 * (1.0 + stiff)
+    late, over = share * share * dt, share * (share * dt + loss)
+    return Spring(soft, late, over, (1.0 - share) * (share * dt + loss), share)
+
+
+def transmit(both: Sides, dt: float | jax.Array, spring: Spring, rest: jax.Array, held: jax.Array) -> Passed:
+    """Solve motors and links together where `held` `[n]`; elsewhere nothing passes between them."""
+    # motor: J (w' - w) = dt (tau - s - kp (late slip' + ahead of it) - kv (slip' - slip) - damped (v' - v) / dt)
+    late, over, before = spring.late, spring.over, (1.0 - spring.share) * spring.share * dt
     slow = both.motor + dt * late * both.kp + dt * both.kv
     rigid = both.motor + both.damped
-    drive = dt * both.torque + (both.motor + dt * both.kv) * both.slip
-    over = late + loss
-    below = jnp.where(held, slow * soft + dt * over, 1.0)
+    drive = dt * both.torque + (both.motor + dt * both.kv - dt * before * both.kp) * both.slip
+    below = jnp.where(held, slow * spring.soft + dt * over, 1.0)
     gain = jnp.where(held, over / below, 0.0)
-    pull = jnp.where(held, (over * drive + slow * (both.twist - rest)) / below, 0.0)
+    wound = both.twist + spring.ahead * both.slip - rest
+    pull = jnp.where(held, (over * drive + slow * wound) / below, 0.0)
     # link: Y (v' - v) = push + dt s, with s = pull - gain rigid (v' - v)
     matrix = both.inertia + jnp.diag(dt * gain * rigid - both.inside)
     change = (inverse(matrix) * (both.push + dt * pull)).sum(-1)
@@ -238,32 +266,29 @@ def transmit(
     return Passed(torque, change, (drive - dt * torque - rigid * change) / slow)
 
 
-def sprung(
-    both: Sides, dt: float | jax.Array, soft: jax.Array, ratio: jax.Array | float
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """(soft, loss, late) for `transmit` of springs of compliance `soft` `[n]`, damped by `ratio` of critical.
-
-    A resolved spring is looked at where the sub-step begins, which costs no energy; a stiff one where it ends.
-    """
-    period = jnp.where(both.on, soft * both.series, 0.0)  # J_s / k
-    root = jnp.sqrt(jnp.where(period > 0, period, 1.0))
-    loss = jnp.where(period > 0, 2 * ratio * root, 0.0)  # d / k = 2 zeta sqrt(J_s / k)
-    squares = period / (dt**2 * (1 + period * both.kp / both.motor))
-    return soft, loss, dt * jnp.maximum(1.0 - squares, 0.0)
-
-
 def finish(
-    at: Site, memory: Any, step: SubStep, both: Sides, passed: Passed, twist: jax.Array, encoder: jax.Array | None
+    at: Site,
+    memory: Any,
+    step: SubStep,
+    both: Sides,
+    passed: Passed,
+    twist: jax.Array,
+    share: jax.Array,
+    encoder: jax.Array | None,
 ) -> tuple[dict, jax.Array]:
     """(memory, generalised force `[nv]`): the link gets what passed instead of what the actuators exert.
 
-    twist: where the sub-step begins; memory: so far; encoder: see `shown`.
+    twist: where the sub-step begins; memory: so far; share: of the slip at its end in the way (`Spring`); encoder: see
+    `shown`.
     """
-    own = passed.torque + both.inside * passed.change / step.dt - both.lost
+    own = passed.torque + (both.inside / step.dt + both.beside) * passed.change - both.lost
     speed = step.qvel[at.dadr] + passed.change + jnp.where(both.on, passed.slip, 0.0)
     twist, origin = jnp.where(both.on, twist, 0.0), memory["origin"]
     if encoder is not None:
         origin = jnp.where(memory["fresh"], encoder * twist, origin)
+    if not staggered(at.mj_model):  # `follow` adds half a sub-step's way at the slip that the simulation ends with
+        way = step.dt * ((1.0 - share) * both.slip + (share - 0.5) * passed.slip)
+        twist = twist + jnp.where(both.on, way, 0.0)
     memory = {"twist": twist, "speed": speed, "origin": origin, "fresh": jnp.zeros((), bool)}
     return memory, at.scatter(jnp.where(both.on, own, 0.0))
 
