@@ -89,7 +89,10 @@ def clipped(log: Log, targets: Mapping[str, Array]) -> Iterator[Finding]:
         for end in (float(x.max()), float(x.min())):
             flat = _flat(x, end)
             share = float(np.mean(flat))
-            if share > LEAST and not (target is not None and _steady(target[flat], quantum(x))):
+            if share <= LEAST:
+                continue
+            # most values of a target that does not change lie within a step of the encoder
+            if target is None or np.subtract(*np.quantile(target[flat], (0.9, 0.1))) > quantum(x):
                 text = f"{name} is clipped at {end:.5g} ({percent(share)} of the rows"
                 drive = name.startswith("effort:")
                 end_of = "the drive's limit" if drive else "a hard stop"
@@ -103,12 +106,6 @@ def _measured(log: Log) -> Iterator[tuple[str, Array]]:
         pairs = zip(names, values.T, strict=True)
         yield from ((name, c) for (n, name), c in pairs if n in kinds and name not in log.absent)
     yield from ((n, s) for n, s in log.streams.items() if n.startswith("effort:") and np.isfinite(s).all())
-
-
-def _steady(target: Array, step: float) -> bool:
-    """Whether most values of a target lie within a step of the encoder."""
-    low, high = np.quantile(target, (0.1, 0.9))
-    return bool(high - low <= step)
 
 
 def _flat(x: Array, end: float) -> NDArray[np.bool_]:
