@@ -158,7 +158,7 @@ def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
     """
     if not (np.isfinite(dt) and dt > 0):
         raise UserError(f"gate: dt = {dt!r}; allowed: seconds > 0")
-    reports = tuple(_report(log, mj_model, dt) for log in logs)
+    reports = tuple(_report(log, mj_model, dt, len(logs)) for log in logs)
     usable = [r for r in reports if r.usable]
     seen = [v for r in usable for v in r.velocities]
     first = [(e.joint, e.late) for r in usable for e in r.first]
@@ -166,17 +166,17 @@ def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
     return Gate(reports, agreeing(seen, max([dt, *(r.log.period for r in usable)])), timing)
 
 
-def unusable(log: Log, dt: float) -> bool:
-    """Whether a log is refused on its own, before it is compared with a model."""
-    return any(f.kind == "refused" for f in _alone(log, dt))
+def unusable(log: Log, dt: float, logs: int) -> bool:
+    """Whether one of so many logs is refused on its own, before it is compared with a model."""
+    return any(f.kind == "refused" for f in _alone(log, dt, logs))
 
 
-def _alone(log: Log, dt: float) -> tuple[Finding, ...]:
-    return tuple(f for test in single_log.CHECKS for f in test(log, dt))
+def _alone(log: Log, dt: float, logs: int) -> tuple[Finding, ...]:
+    return tuple(f for test in single_log.CHECKS for f in test(log, dt, logs))
 
 
-def _report(log: Log, mj_model: mujoco.MjModel, dt: float) -> Report:
-    own = _alone(log, dt)
+def _report(log: Log, mj_model: mujoco.MjModel, dt: float, logs: int) -> Report:
+    own = _alone(log, dt, logs)
     if any(f.kind == "refused" for f in own):
         return Report(log, own)  # nothing further can be computed from it
     found = () if log.lost else tuple(efforts(log, mj_model))  # forces on a joint need the motion of all
