@@ -21,7 +21,8 @@ from bayessim_mjx.logs.stamps import WINDOW
 LEAST = 5e-3  # rad or m, apart from which two values are two
 # An order is far better if it leaves less than this share of the variance that the given one leaves, where that is more
 # than this share of all. Counted over simulated chains: of 160 right orders none is doubted, of 106 wrong ones whose
-# joints are driven in different ways 88 are found, 87 with the right order
+# joints are driven in different ways 88 are found, 87 with the right order. Of weak and stiff servos, 4 of 5 with
+# different targets, no right order of 200 is doubted, and of 200 wrong ones 129 are found, 112 with the right order
 FAR = 0.5
 ENOUGH = 20_000  # rows that decide between orders, spread over the log; shares of a variance change by less than 1 %
 FEW = 5  # values off the motion from which another publisher is behind them; rule of thumb
