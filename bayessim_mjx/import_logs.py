@@ -186,6 +186,7 @@ def _logs(argv: Sequence[str] | None) -> int:
 
 def _checked(args: argparse.Namespace) -> int:
     """Print how the logs are read; exit code 0, or 2 where something has to be mended."""
+    from bayessim_mjx.logs.last_words import last_words
     from bayessim_mjx.logs.overview import overview
 
     path = Path(args.path)
@@ -203,11 +204,9 @@ def _checked(args: argparse.Namespace) -> int:
     if found.end:
         print(found.end)
     if not found.faults:
-        own = cli.urdf_words(args.drive, args.packages)
-        first = "nothing is missing; next:"
-        if found.doubts:
-            first = f"no channel is missing; check the map against {count(len(found.doubts), 'note')} above, then:"
-        print(" ".join([first, "bayessim-mjx diagnose --model", args.model, *own, "--data", str(path)]))
+        words = [args.model, *cli.urdf_words(args.drive, args.packages), "--data", str(path)]
+        file = args.map or (path / "map.yaml" if path.is_dir() else "a map for --map")
+        print(last_words(found, str(file), " ".join(["bayessim-mjx diagnose --model", *words])))
     return 2 if found.faults else 0
 
 
@@ -233,6 +232,7 @@ def _gated(args: argparse.Namespace, found: "Overview") -> None:
     elif lacking := cutting.too_few(said.usable, period):
         found.refused.append(lacking)
     found.doubts += said.doubts
+    found.exchanged += said.exchanged
     found.notes += [text for text in (*said.doubts, *said.findings) if text not in found.notes]
 
 
@@ -241,13 +241,14 @@ def _shown(args: argparse.Namespace) -> int:
     for flag, path in (("--out", args.out), ("--mcap", args.mcap)):
         if path:
             cli.writable(Path(path).parent, flag)
-    from bayessim_mjx.logs import excited, mcap_file, views
+    from bayessim_mjx.logs import exchanged, mcap_file, views
     from bayessim_mjx.report import log_page
 
     if args.mcap:
         mcap_file.writer()
-    shown = views.view(Path(args.path), _model(args), args.map)
-    crossed = excited.swapped(shown.sheets, shown.pairs)
+    model = _model(args)
+    shown = views.view(Path(args.path), model, args.map)
+    crossed = [x.sentence for x in (exchanged.exchanges(shown.overview.logs, model) if shown.overview.logs else ())]
     shown.overview.notes += crossed
     for fault in (*shown.overview.faults, *crossed):
         print(fault)

@@ -240,9 +240,10 @@ def _measured(
 
 def _looked_at(logs: Sequence[Log], robot: Robot, dt: float, say: Callable[[Look], None]) -> tuple[gate.Gate, Look]:
     """Run the gate after the look, which is faster and said at once; again where the gate refuses more logs."""
-    sound = [log for log in logs if not gate.unusable(log, dt)]
+    sound = [log for log in logs if not gate.unusable(log, dt, len(logs))]
     seen = looked(sound, robot)
-    say(seen)
+    if sound:
+        say(seen)
     found = gate.check(logs, robot.mj_model, dt)
     if 0 < len(found.usable) < len(sound):
         seen = looked(found.usable, robot)

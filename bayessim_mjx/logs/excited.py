@@ -1,20 +1,16 @@
-"""What commands move: coherence of each command with each joint, and columns that look exchanged."""
+"""What commands move: coherence of each command with each joint."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import signal
 
+from bayessim_mjx.logs.exchanged import SWAPPED
 from bayessim_mjx.logs.log import Array
 from bayessim_mjx.logs.views import LEAST, SEGMENT, Sheet, even, joints, velocity
-
-# Both of two crossed coherences are at least this large, and their product this many times that of the straight ones.
-# Rules of thumb: of 50 logs of a two-joint arm none is so, with two columns exchanged all are
-CROSSED, MORE = 0.4, 1.1
 
 
 @dataclass(frozen=True)
@@ -40,31 +36,6 @@ def excitation(sheets: Sequence[Sheet]) -> Excitation | None:
     return Excitation(commands, moved, np.array([[_coherent(sheets, f"ctrl:{c}", j) for j in moved] for c in commands]))
 
 
-def swapped(sheets: Sequence[Sheet], pairs: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return a sentence for each two joints that move with each other's command more than with their own.
-
-    Args:
-        pairs: {joint: actuators that drive it}; joints with one actuator are compared.
-    """
-    found = excitation(sheets) if len(pairs) > 1 else None
-    if found is None:
-        return []
-    own = {j: c for j, (c, *more) in pairs.items() if not more and j in found.joints and c in found.commands}
-
-    def moves(joint: str, command: str) -> float:
-        return float(found.coherence[found.commands.index(command), found.joints.index(joint)])
-
-    said = []
-    for (a, of_a), (b, of_b) in itertools.combinations(own.items(), 2):
-        crossed, straight = (moves(a, of_b), moves(b, of_a)), (moves(a, of_a), moves(b, of_b))
-        more = crossed[0] > straight[0] and crossed[1] > straight[1]
-        if more and min(crossed) > CROSSED and crossed[0] * crossed[1] > MORE * straight[0] * straight[1]:
-            here = f"coherence {crossed[1]:.2f} and {crossed[0]:.2f}"
-            own_ones = f"with their own {straight[1]:.2f} and {straight[0]:.2f}"
-            said.append(f"{crossing(b, of_a, a, of_b)} ({here}, {own_ones})")
-    return said
-
-
 def _coherent(sheets: Sequence[Sheet], command: str, joint: str) -> float:
     """Coherence of a command with a joint's velocity: spectra are summed over the logs before they are divided."""
     length = min([SEGMENT, *(max(len(s.time) // 4, LEAST) for s in sheets)])
@@ -87,7 +58,7 @@ def _coherent(sheets: Sequence[Sheet], command: str, joint: str) -> float:
 
 def crossing(joint: str, command: str, other: str, its_command: str) -> str:
     """Ask whether two joints' columns are exchanged."""
-    return f"{joint} moves with {command} and {other} with {its_command}: are the columns swapped?"
+    return f"{joint} moves with {command} and {other} with {its_command}: {SWAPPED}"
 
 
 def moved_most(sheet: Sheet, command: str, but: str) -> str:

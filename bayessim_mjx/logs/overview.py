@@ -18,18 +18,16 @@ from bayessim_mjx.logs import inertial, units
 from bayessim_mjx.logs.channel_units import units_of
 from bayessim_mjx.logs.check import needed_columns
 from bayessim_mjx.logs.csv_files import form_of
+from bayessim_mjx.logs.exchanged import Exchange
 from bayessim_mjx.logs.files import SUFFIXES, map_of_folder
-from bayessim_mjx.logs.importers.publishers import better_order
-from bayessim_mjx.logs.importers.streams import Stream
 from bayessim_mjx.logs.log import Array, Channels, Log
 from bayessim_mjx.logs.mapping import LogMap, Source
-from bayessim_mjx.logs.names import drives
+from bayessim_mjx.logs.names import channel
 from bayessim_mjx.logs.pieces import MAX_GAP, SHORT_GAP
 from bayessim_mjx.logs.proposal import Proposal, native, propose
 from bayessim_mjx.logs.read import check_map, read_logs, table_of
 from bayessim_mjx.logs.table import Table
 from bayessim_mjx.logs.transport import described
-from bayessim_mjx.logs.vendors import hinges
 
 HEAD = """# Proposed from the names of the columns; read it, and edit it (docs/logs.md).
 # A channel is `name: column`, or `name: {column: ..., unit: deg, sign: -1, offset: 0.1}`.
@@ -52,6 +50,9 @@ class Overview:
         logs: as a diagnosis reads them, where nothing has to be mended.
         doubts: of the notes those that a wrong map may explain; end: the last line, of how many logs are refused.
         layouts: the different columns of the files.
+        sources: {channel: its column} of the first file; mapped: whether a map names them.
+        unmeasured: {position that was not measured: columns of no channel whose names suggest it}.
+        exchanged: commands that fit the motion of other joints.
     """
 
     columns: list[tuple[str, ...]] = field(default_factory=list)
@@ -64,6 +65,10 @@ class Overview:
     logs: list[Log] = field(default_factory=list)
     end: str = ""
     layouts: list[tuple[str, ...]] = field(default_factory=list)
+    sources: dict[str, str] = field(default_factory=dict)
+    mapped: bool = False
+    unmeasured: dict[str, list[str]] = field(default_factory=dict)
+    exchanged: list[Exchange] = field(default_factory=list)
 
     @property
     def faults(self) -> list[str]:
@@ -167,6 +172,9 @@ def _one(out: Overview, file: Path, log_map: LogMap, model: mujoco.MjModel | Non
         out.notes += described(table, sources)
     out.notes += [str(w.message) for w in said]
     layout = tuple(table.columns)
+    if not out.layouts:
+        out.sources = {name: str(source.column) for name, source in sources.items() if source.column is not None}
+        out.mapped = log_map.names_channels
     if layout not in out.layouts:
         out.layouts.append(layout)
         out.columns += [(f"{file.name}:", "", "", "", "")] if len(out.layouts) > 1 else []
@@ -188,6 +196,10 @@ def _one(out: Overview, file: Path, log_map: LogMap, model: mujoco.MjModel | Non
         have = [*sources, *(["time"] if time is not None else [])]
         lost = [name for name in needed_columns(have, Channels.of(model)) if name not in have]
         _missing(out, file, lost, Channels.of(model))
+        free = [column for column in table.columns if column not in {str(s.column) for s in sources.values()}]
+        for name in (n for n in lost if n.startswith("qpos:")):
+            joint = name.partition(":")[2]
+            out.unmeasured[name] = [c for c in free if channel(c, model) in (("qpos", joint), ("", joint))]
 
 
 def _missing(out: Overview, file: Path, lost: Sequence[str], channels: Channels) -> None:
@@ -289,27 +301,9 @@ def _read(out: Overview, files: Sequence[Path], log_map: LogMap, model: mujoco.M
         warnings.simplefilter("always")
         try:
             out.logs = list(read_logs(files, model, log_map, partial=True))
-            out.notes += list(dict.fromkeys(text for log in out.logs if (text := _order(log, model))))
         except UserError:
             out.refused += [text for text in (_refusal(file, log_map, model) for file in files) if text]
     out.notes += list(dict.fromkeys(str(w.message) for w in said))
-
-
-def _order(log: Log, model: mujoco.MjModel) -> str:
-    """Say which other order of the commands fits the motion far better, if one does."""
-    drive_of = {j: own[0] for j in hinges(model) if len(own := drives(model, log.joints.index(j))) == 1}
-    kinds = {"position": (log.qpos, log.channels.qpos, "qpos"), "velocity": (log.qvel, log.channels.qvel, "qvel")}
-    measured = {
-        kind: {j: Stream(log.time, x[:, names.index(j)]) for j in drive_of if f"{stream}:{j}" not in log.absent}
-        for kind, (x, names, stream) in kinds.items()
-    }
-    sent = {j: Stream(log.time, log.ctrl[:, i], "held") for j, i in drive_of.items()}
-    found = better_order(sent, {**measured, "effort": {}})
-    if found is None:
-        return ""
-    given, better = ([log.actuators[drive_of[j]] for j in order] for order in found[:2])
-    text = f"the commands {', '.join(given)} fit the motion far better as those of {', '.join(better)} ({found[2]})"
-    return f"{text}; `ctrl` in the map says which column is whose"
 
 
 def _refusal(file: Path, log_map: LogMap, model: mujoco.MjModel) -> str:

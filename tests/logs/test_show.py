@@ -66,16 +66,6 @@ def test_a_joint_follows_its_own_command() -> None:
     assert found.coherence[0, 0] > 0.95 and found.coherence[1, 0] < 0.4
 
 
-def test_columns_that_were_exchanged_are_said_once_and_straight_ones_never() -> None:
-    """Each command pushes its own joint, and a little the other one."""
-    one, two = np.cumsum(np.random.default_rng(1).normal(size=(2, len(T))), axis=1) * 0.1
-    speeds = {"qvel_a": one + 0.2 * two, "qvel_b": two + 0.2 * one, "qpos_a": 0 * T, "qpos_b": 0 * T}
-    pairs = {"a": ["u"], "b": ["v"]}
-    assert not excited.swapped([sheet(ctrl_u=one, ctrl_v=two, **speeds)], pairs)
-    (said,) = excited.swapped([sheet(ctrl_u=two, ctrl_v=one, **speeds)], pairs)
-    assert said.startswith("b moves with u and a with v: are the columns swapped?")
-
-
 def test_a_long_line_keeps_its_extremes() -> None:
     values = np.random.default_rng(0).normal(size=100_000)
     time, shown = views.thinned(np.arange(100_000.0), values, 500)

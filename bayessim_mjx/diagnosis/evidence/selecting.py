@@ -142,11 +142,12 @@ def select(
     chosen = {int(g): search.weighing.without(int(g)).answer for g in names} if len(names) > 1 and found.answer else {}
     answer = state.models[found.answer]
     several = len(answer.effects) > 1 and not settings.budget.over(LEAVING_OUT)
+    subsets = _subsets(state, answer, say) if several else {}
     return Selection(
         state=state,
         answer=answer,
         rivals={e.label: tuple(_rivals(search.weighing, e, found)) for e in answer.effects},
-        subsets=_subsets(state, answer, say) if several else {},
+        subsets=subsets,
         elsewhere=_elsewhere(state, chosen),
         promised=promised(state, answer.effects) if answer.effects else (0.0, {}),
         chosen=chosen,
@@ -178,7 +179,10 @@ def _rival(weighing: Weighing, effect: Candidate, key: Key, found: Weighed) -> R
 
 
 def _subsets(state: SearchState, answer: Model, say: Progress) -> dict[Key, Model]:
-    """{labels: the model with these of the answer's effects}, each fitted from one with one effect more."""
+    """{labels: the model with these of the answer's effects}, each fitted from one with one effect more.
+
+    None has a larger error than one that it contains (`none_worse`).
+    """
     every = frozenset(e.label for e in answer.effects)
     for size in range(len(every) - 1, 0, -1):
         entries: Entries = {}
@@ -188,9 +192,39 @@ def _subsets(state: SearchState, answer: Model, say: Progress) -> dict[Key, Mode
                 kept = tuple(e for e in parent.effects if e.label in own)
                 entries[own] = ([cut_back(state, parent, kept)], kept)
         fit_entries(state, entries, "leaving effects out", say, LEAVING_OUT)
-    known = itertools.chain.from_iterable(itertools.combinations(every, n) for n in range(len(every) + 1))
-    found = {frozenset(own): state.models.get(frozenset(own)) for own in known}
-    return {own: model for own, model in found.items() if model is not None} if all(found.values()) else {}
+    keys = [frozenset(own) for n in range(len(every)) for own in itertools.combinations(sorted(every), n)]
+    if not all(key in state.models for key in keys):
+        return {}
+    found = none_worse(state, keys, say)
+    return found | {every: min((answer, *found.values()), key=lambda model: model.total)}
+
+
+def none_worse(state: SearchState, keys: Sequence[Key], say: Progress) -> dict[Key, Model]:
+    """{fitted set: the best model that it contains}: with its further effects neutral a set is each of its subsets.
+
+    A fit may rest far off all the same, as the evidence takes a part of its error for a force. A set with a larger
+    held-out error than one of its subsets is fitted again from there, its further effects neutral and as it has them;
+    `state.models` keeps the better fit. Where that is still worse, the subset's model is its own.
+    """
+    out: dict[Key, Model] = {}
+    for size in sorted({len(key) for key in keys}):
+        old = {key: state.models[key] for key in keys if len(key) == size}
+        within = {k: min((out[j] for j in out if j < k), key=lambda m: m.total, default=own) for k, own in old.items()}
+        entries: Entries = {}
+        for key, less in within.items():
+            if less.total < old[key].total:
+                held = {e.label for e in less.effects}
+                further = tuple(e for e in old[key].effects if e.label not in held)
+                coordinates = [c for e in further for c in e.coordinates]
+                starts = np.array([c.neutral for c in coordinates]), np.concatenate([*map(old[key].values_of, further)])
+                begun = state.begun(less.fit)
+                fits = [state.fitter.derive(begun, coordinates, values) for values in starts]
+                entries[key] = fits, (*less.effects, *further)
+        fit_entries(state, entries, "leaving effects out", say, LEAVING_OUT)
+        for key, model in old.items():
+            state.models[key] = min(model, state.models[key], key=lambda m: m.total)
+            out[key] = min(state.models[key], within[key], key=lambda m: m.total)
+    return out
 
 
 def _elsewhere(state: SearchState, chosen: Mapping[int, Key]) -> float:

@@ -14,6 +14,7 @@ from bayessim_mjx.diagnosis.logcheck.effort import Relation
 from bayessim_mjx.diagnosis.logcheck.single_log import Finding
 from bayessim_mjx.diagnosis.logcheck.timing import Late, Timing
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.logs.exchanged import SWAPPED, Exchange, exchanges
 from bayessim_mjx.logs.log import Array, Log
 from bayessim_mjx.logs.velocities import Velocity, agreeing, velocities
 from bayessim_mjx.quantities import MOST, listed
@@ -42,6 +43,16 @@ class Report:
         """One relation of each joint that was tested: a stream of efforts comes before the command."""
         return [*{r.joint: r for r in reversed(self.relations) if r.explained is not None}.values()]
 
+    def unexplained(self, drives: int) -> bool:
+        """Whether neither motion nor exchanged columns explain the efforts of so many drives; False of broken logs."""
+        sound = [(r.explained or 0.0) >= effort.SOUND for r in self.first]
+        known = any(SWAPPED in r.mend for r in self.relations) or len(sound) == drives and all(sound)
+        return (self.usable or bool(self.relations)) and not known
+
+    def saying(self, text: str) -> Report:
+        """With one more remark, which warns of a usable log and says why another one is refused."""
+        return replace(self, remarks=(*self.remarks, Finding("warning" if self.usable else "refused", text)))
+
     def of(self, kind: str) -> tuple[str, ...]:
         """Return the texts of one kind: refused, warning or finding."""
         return tuple(r.text for r in self.remarks if r.kind == kind)
@@ -54,11 +65,13 @@ class Gate:
     Attributes:
         qvel: per measured velocity channel, whether it agrees with its position in most of the usable logs.
         timing: of the usable logs.
+        exchanged: commands that fit the motion of other joints, in logs whose efforts nothing better explains.
     """
 
     reports: tuple[Report, ...]
     qvel: dict[str, bool]
     timing: Timing
+    exchanged: tuple[Exchange, ...] = ()
 
     @property
     def usable(self) -> tuple[Log, ...]:
@@ -158,25 +171,28 @@ def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
     """
     if not (np.isfinite(dt) and dt > 0):
         raise UserError(f"gate: dt = {dt!r}; allowed: seconds > 0")
-    reports = tuple(_report(log, mj_model, dt) for log in logs)
+    reports = tuple(_report(log, mj_model, dt, len(logs)) for log in logs)
+    crossed = exchanges([r.log for r in reports if r.unexplained(mj_model.nu)], mj_model)
+    said = {id(log): x.sentence for x in crossed for log in x.logs}
+    reports = tuple(r.saying(said[id(r.log)]) if id(r.log) in said else r for r in reports)
     usable = [r for r in reports if r.usable]
     seen = [v for r in usable for v in r.velocities]
     first = [(e.joint, e.late) for r in usable for e in r.first]
     timing = Timing(pooled((v.channel, Late(v.lag)) for v in seen), pooled(first))
-    return Gate(reports, agreeing(seen, max([dt, *(r.log.period for r in usable)])), timing)
+    return Gate(reports, agreeing(seen, max([dt, *(r.log.period for r in usable)])), timing, crossed)
 
 
-def unusable(log: Log, dt: float) -> bool:
-    """Whether a log is refused on its own, before it is compared with a model."""
-    return any(f.kind == "refused" for f in _alone(log, dt))
+def unusable(log: Log, dt: float, logs: int) -> bool:
+    """Whether one of so many logs is refused on its own, before it is compared with a model."""
+    return any(f.kind == "refused" for f in _alone(log, dt, logs))
 
 
-def _alone(log: Log, dt: float) -> tuple[Finding, ...]:
-    return tuple(f for test in single_log.CHECKS for f in test(log, dt))
+def _alone(log: Log, dt: float, logs: int) -> tuple[Finding, ...]:
+    return tuple(f for test in single_log.CHECKS for f in test(log, dt, logs))
 
 
-def _report(log: Log, mj_model: mujoco.MjModel, dt: float) -> Report:
-    own = _alone(log, dt)
+def _report(log: Log, mj_model: mujoco.MjModel, dt: float, logs: int) -> Report:
+    own = _alone(log, dt, logs)
     if any(f.kind == "refused" for f in own):
         return Report(log, own)  # nothing further can be computed from it
     found = () if log.lost else tuple(efforts(log, mj_model))  # forces on a joint need the motion of all

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.logcheck.drives import LEAST
 from bayessim_mjx.logs.log import Array, Log
-from bayessim_mjx.logs.signals import quantum
+from bayessim_mjx.logs.signals import moves, quantum
 from bayessim_mjx.logs.velocities import bandwidth
 from bayessim_mjx.quantities import percent
 
@@ -29,7 +29,7 @@ class Finding:
     delay: float = 0.0
 
 
-def size(log: Log, dt: float) -> Iterator[Finding]:
+def size(log: Log, dt: float, logs: int) -> Iterator[Finding]:
     """Rows, duration and rate against the control period dt [s]."""
     if len(log) < ROWS or log.duration < ROWS / 2 * dt:
         have = f"{len(log)} rows over {log.duration:.3g} s"
@@ -46,7 +46,7 @@ def size(log: Log, dt: float) -> Iterator[Finding]:
         yield Finding("refused", "the drive is off throughout; allowed: a log with commands that act")
 
 
-def jitter(log: Log, dt: float) -> Iterator[Finding]:
+def jitter(log: Log, dt: float, logs: int) -> Iterator[Finding]:
     """Count steps of time more than a fifth off their median."""
     steps = np.diff(log.time)
     off = float(np.mean(np.abs(steps / log.period - 1.0) > 0.2))
@@ -58,14 +58,17 @@ def jitter(log: Log, dt: float) -> Iterator[Finding]:
         )
 
 
-def constant(log: Log, dt: float) -> Iterator[Finding]:
-    """Joints that never move, commands that never change; nothing moving at all is refused."""
-    ranges = np.ptp(log.qpos, axis=0)
-    level = 6.0 * log.sigma_qpos + 1e-12
+def constant(log: Log, dt: float, logs: int) -> Iterator[Finding]:
+    """Joints that never move, commands that never change; nothing moving at all is refused.
+
+    logs: how many are judged together: in none of their channels noise is to count as motion (`signals.STILL`).
+    """
+    tested = logs * (len(log.sigma_qpos) + len(log.sigma_qvel))
+    moved = np.array([moves(x, s, tested) for x, s in zip(log.qpos.T, log.sigma_qpos, strict=True)], bool)
     seen = [j for j in log.joints if log.seen_dofs[log.channels.columns(j, "qvel")].all()]
-    still = [j for j in seen if not (ranges > level)[log.channels.columns(j)].any()]
-    fast = np.ptp(log.qvel, axis=0) > 6.0 * log.sigma_qvel + 1e-12
-    if len(still) == len(seen) and not (log.absent and (fast & log.seen_speeds).any()):
+    still = [j for j in seen if not moved[log.channels.columns(j)].any()]
+    own = zip(log.qvel.T, log.sigma_qvel, log.seen_speeds & bool(log.absent), strict=True)
+    if len(still) == len(seen) and not any(moves(x, s, tested) for x, s, fast in own if fast):
         yield Finding("refused", f"nothing moves: {', '.join(still)} stay within their noise")
         return
     for joint in still:
@@ -89,7 +92,10 @@ def clipped(log: Log, targets: Mapping[str, Array]) -> Iterator[Finding]:
         for end in (float(x.max()), float(x.min())):
             flat = _flat(x, end)
             share = float(np.mean(flat))
-            if share > LEAST and not (target is not None and _steady(target[flat], quantum(x))):
+            if share <= LEAST:
+                continue
+            # most values of a target that does not change lie within a step of the encoder
+            if target is None or np.subtract(*np.quantile(target[flat], (0.9, 0.1))) > quantum(x):
                 text = f"{name} is clipped at {end:.5g} ({percent(share)} of the rows"
                 drive = name.startswith("effort:")
                 end_of = "the drive's limit" if drive else "a hard stop"
@@ -105,12 +111,6 @@ def _measured(log: Log) -> Iterator[tuple[str, Array]]:
     yield from ((n, s) for n, s in log.streams.items() if n.startswith("effort:") and np.isfinite(s).all())
 
 
-def _steady(target: Array, step: float) -> bool:
-    """Whether most values of a target lie within a step of the encoder."""
-    low, high = np.quantile(target, (0.1, 0.9))
-    return bool(high - low <= step)
-
-
 def _flat(x: Array, end: float) -> NDArray[np.bool_]:
     """Rows `[T]` in runs of four or more on the value `end` that are entered faster than a fifth of the top rate."""
     on = np.concatenate([[False], x == end, [False]])
@@ -123,7 +123,7 @@ def _flat(x: Array, end: float) -> NDArray[np.bool_]:
     return rows
 
 
-def wrapped(log: Log, dt: float) -> Iterator[Finding]:
+def wrapped(log: Log, dt: float, logs: int) -> Iterator[Finding]:
     """Signed registers read as unsigned: jumps by 2^16 or 2^32 resolution steps."""
     for name, x in log.streams.items():
         x = x[np.isfinite(x)]
@@ -170,4 +170,4 @@ def _speed(log: Log, column: int) -> Array:
     )
 
 
-CHECKS = (size, jitter, constant, wrapped)
+CHECKS = (size, jitter, constant, wrapped)  # of (log, control period, how many logs there are)

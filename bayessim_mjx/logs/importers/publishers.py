@@ -16,13 +16,13 @@ from bayessim_mjx.logs.importers.streams import Stream
 from bayessim_mjx.logs.log import Array
 from bayessim_mjx.logs.signals import COUNTS, STEPS, derivative, noise_level, quantum
 from bayessim_mjx.logs.stamps import WINDOW
-from bayessim_mjx.quantities import percent
 
 # Rules of thumb, not measured.
 LEAST = 5e-3  # rad or m, apart from which two values are two
 # An order is far better if it leaves less than this share of the variance that the given one leaves, where that is more
 # than this share of all. Counted over simulated chains: of 160 right orders none is doubted, of 106 wrong ones whose
-# joints are driven in different ways 88 are found, 87 with the right order
+# joints are driven in different ways 88 are found, 87 with the right order. Of weak and stiff servos, 4 of 5 with
+# different targets, no right order of 200 is doubted, and of 200 wrong ones 129 are found, 112 with the right order
 FAR = 0.5
 ENOUGH = 20_000  # rows that decide between orders, spread over the log; shares of a variance change by less than 1 %
 FEW = 5  # values off the motion from which another publisher is behind them; rule of thumb
@@ -166,8 +166,8 @@ def _two_tracks(messages: Sequence[Message], received: bool) -> str:
 
 def better_order(
     sent: Mapping[str, Stream], measured: Mapping[str, Mapping[str, Stream]]
-) -> tuple[list[str], list[str], str] | None:
-    """Return (joints as given, in the order that fits the motion far better, the shares explained), or None.
+) -> tuple[list[str], list[str], tuple[float, float]] | None:
+    """Return (joints as given, in the order that fits the motion far better, shares explained by both), or None.
 
     Each command is explained by a linear combination of one joint's position, its sine and cosine, velocity and its
     sign, acceleration and effort; of all orders the one that explains most is compared with the given one (Kuhn 1955,
@@ -180,26 +180,32 @@ def better_order(
     clock = measured["position"][joints[0]].sorted().time if len(joints) > 1 else np.zeros(0)
     if len(joints) < 2 or len(clock) < WINDOW * len(joints):
         return None
-    features = [_features(measured, joint, clock) for joint in joints]
-    left = np.array([[_unexplained(sent[command].on(clock), f) for f in features] for command in joints])
+    commands, places = ([x[j].on(clock) for j in joints] for x in (sent, measured["position"]))
+    if max(map(_unexplained, commands, map(_of_place, places))) < FAR:
+        return None  # with further features a part of the given order leaves less still, and these are dear
+    features = [_features(measured, joint, q, clock) for joint, q in zip(joints, places, strict=True)]
+    left = np.array([[_unexplained(x, f) for f in features] for x in commands])
     rows, best = linear_sum_assignment(np.log(np.maximum(left, np.finfo(np.float32).eps)))
     moved = rows != best
     given, other = (float(left[rows, k][moved].mean()) if moved.any() else 0.0 for k in (rows, best))
     if given < FAR or other > FAR * given:
         return None
-    return joints, [joints[j] for j in best], f"explains {percent(1.0 - other)} in place of {percent(1.0 - given)}"
+    return joints, [joints[j] for j in best], (1.0 - given, 1.0 - other)
 
 
-def _features(measured: Mapping[str, Mapping[str, Stream]], joint: str, clock: Array) -> Array:
-    """Return [T, n] of what one joint shows at the times [T], as far as it was sampled there."""
-    q = measured["position"][joint].on(clock)
+def _of_place(q: Array) -> Array:
+    return np.stack([np.ones_like(q), q, np.sin(q), np.cos(q)], 1)
+
+
+def _features(measured: Mapping[str, Mapping[str, Stream]], joint: str, q: Array, clock: Array) -> Array:
+    """Return [T, n] of what one joint at q [T] shows at the times [T], as far as it was sampled there."""
     seen = np.isfinite(q)
     if seen.sum() < len(seen):
         q = np.interp(clock, clock[seen], q[seen])
     speed, _ = derivative(clock, q, noise_level(q))
     change, _ = derivative(clock, speed, noise_level(speed))
     effort = [measured["effort"][joint].on(clock)] if joint in measured["effort"] else []
-    return np.stack([np.ones_like(q), q, np.sin(q), np.cos(q), speed, np.sign(speed), change, *effort], 1)
+    return np.column_stack([_of_place(q), speed, np.sign(speed), change, *effort])
 
 
 def _unexplained(x: Array, features: Array) -> float:

@@ -32,6 +32,7 @@ from bayessim_mjx.logs.importers.messages import (
 )
 from bayessim_mjx.logs.importers.publishers import better_order, of_one_publisher, several_senders
 from bayessim_mjx.logs.importers.streams import Recording, Stream
+from bayessim_mjx.quantities import percent
 
 
 def recording(name: str, messages: Iterable[Message], choice: Choice) -> Recording:
@@ -115,7 +116,8 @@ def _sent(
         if hasattr(found[0].body, "data"):
             found_order = better_order(new, measured)
             if found_order is not None:
-                given, better, why = (",".join(x) if isinstance(x, list) else x for x in found_order)
+                (given, better), shares = (",".join(x) for x in found_order[:2]), [*map(percent, found_order[2])]
+                why = f"explains {shares[1]} in place of {shares[0]}"
                 text = f"{name}: {topic}: the motion fits the order {better} far better than {given} ({why})"
                 notes.append(f"{text}: --commands {topic}={better}, if that is the controller's order")
         sent |= new

@@ -10,6 +10,7 @@ import pytest
 from bayessim_mjx.diagnosis.logcheck.gate import Gate, check
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs import Log
+from bayessim_mjx.logs.signals import noise_level
 from tests.diagnosis.recordings import ARM, PENDULUM, record, sines
 
 DT = 0.01
@@ -180,6 +181,28 @@ def test_still_channels(good: Log, arm: Log) -> None:
     assert any(
         "qpos:elbow never moves" in f.text for f in judge(dataclasses.replace(arm, qpos=qpos), ARM).reports[0].remarks
     )
+
+
+@pytest.mark.parametrize("grain", [0.0, 5e-4])
+def test_noise_is_no_motion_however_long_the_logs_are(arm: Log, grain: float) -> None:
+    """The range of noise grows with the rows: of 2000 values it is beyond six standard deviations."""
+    rng, rows, parts = np.random.default_rng(1), 2000, {"ctrl": np.zeros((2000, 2)), "qvel": np.zeros((2000, 2))}
+    still = []
+    for i in range(6):
+        noise = 5e-4 * rng.normal(size=(rows, 2))
+        qpos = [0.3, -0.1] + (np.round(noise / grain) * grain if grain else noise)
+        sigma = np.array([noise_level(x) for x in qpos.T])
+        own = dataclasses.replace(
+            arm, name=f"run{i}", time=0.01 * np.arange(rows), qpos=qpos, sigma_qpos=sigma, **parts
+        )
+        still.append(dataclasses.replace(own, has_qvel=False))
+    assert any(np.ptp(log.qpos, axis=0).max() > 6.0 * log.sigma_qpos.max() for log in still)
+    found = check(still, model(ARM), DT)
+    assert not found.usable and all("nothing moves: shoulder, elbow" in why for why in found.refused.values())
+    creeping = still[0].qpos + 2e-3 * np.sin(2.0 * still[0].time)[:, None] * [0.0, 1.0]
+    moved = check([dataclasses.replace(still[0], qpos=creeping), *still[1:]], model(ARM), DT)
+    assert [log.name for log in moved.usable] == ["run0"]
+    assert any("qpos:shoulder never moves" in text for text in moved.warnings)
 
 
 def test_jitter_and_clipping(good: Log) -> None:
