@@ -1,0 +1,18 @@
+"""Sentences on the time step of the simulator as delivered, and on the one that the diagnosis simulates with."""
+
+from __future__ import annotations
+
+COSTS = (
+    "the simulator's time step of {own} costs {size}{error:.2g} rad or m within a window at {joint}: a gap for every "
+    "policy that is trained with it; "
+)
+REDUCES = "{finer}, or the integrator RK4 where nothing is in contact, reduces it"
+REPLACED = "the diagnosis simulates by {used}, which leaves {left:.2g} noise standard deviations"
+FINER = "; the diagnosis simulates at {used}"
+COUNTS = "; the rest, {rest:.2g} noise standard deviations, counts as noise"
+NO_NOISE = "; the logs show no noise, so everything smaller than this counts as noise"
+
+
+def milliseconds(seconds: float, integrator: str = "") -> str:
+    """`5 ms`, `5 ms (implicitfast)`."""
+    return f"{1e3 * seconds:.3g} ms{f' ({integrator})' if integrator else ''}"
