@@ -16,3 +16,12 @@ NO_NOISE = "; the logs show no noise, so everything smaller than this counts as 
 def milliseconds(seconds: float, integrator: str = "") -> str:
     """`5 ms`, `5 ms (implicitfast)`."""
     return f"{1e3 * seconds:.3g} ms{f' ({integrator})' if integrator else ''}"
+
+
+def written(integrator: str, timestep: float, own: str, own_step: float) -> str:
+    """Return the sentence on a corrected model or file: how the diagnosis simulated, in place of the delivered way."""
+    used, before = (milliseconds(step) for step in (timestep, own_step))
+    return (
+        f"The diagnosis simulated by {integrator} at {used}, in place of {own} at {before}. The errors that it states "
+        "hold for this integrator and this time step."
+    )
