@@ -42,8 +42,9 @@ from bayessim_mjx.logs.log import Log
 def how_far(found: Findings, say: Progress) -> Findings:
     """Add the held-out motion of the simulator as delivered, recalibrated and with the effects."""
     fitter, base, model = found.setup.fitter, found.selection.state.base, found.model
+    delivered = found.setup.discretisation.delivered if found.setup.discretisation else None
     predictions = {
-        "nominal": heldout.nominal(fitter, found.selection.state.nominal),
+        "nominal": heldout.nominal(fitter, found.selection.state.nominal, delivered),
         "calibrated": heldout.predict(fitter, base),
     }
     predictions["with_effects"] = heldout.predict(fitter, model) if model.effects else predictions["calibrated"]

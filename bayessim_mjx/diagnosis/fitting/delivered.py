@@ -68,11 +68,12 @@ class Delivered:
         """Commands `[W, H, nu]` held over control steps, as in training."""
         return np.stack([cut.logs[r].ctrl[a : a + cut.steps] for r, a in zip(cut.log, cut.start, strict=True)])
 
-    def logged(self, cut: Windows) -> Array:
-        """Commands `[W, H, steps, nu]` of windows at finer sub-steps, their means over each step."""
+    def played(self, cut: Windows, offsets: Array) -> Array:
+        """Return `errors` with the logged commands, their means over each of its steps; offsets: `[W, s]`."""
         command = np.asarray(cut.batch.command, np.float64)
         count, length, fine, nu = command.shape
-        return command.reshape(count, length, self.steps, fine // self.steps, nu).mean(3)
+        means = command.reshape(count, length, self.steps, fine // self.steps, nu).mean(3)
+        return self.errors(cut, means, offsets[:, : 2 * self.model.nv])
 
     def errors(self, cut: Windows, command: Array, offsets: Array) -> Array:
         """Measured minus simulated `[W, H, 2 nv]`.

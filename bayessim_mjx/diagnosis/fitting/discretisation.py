@@ -24,7 +24,7 @@ from bayessim_mjx.diagnosis.fitting.substep_errors import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
 from bayessim_mjx.diagnosis.phrases import time_step
-from bayessim_mjx.diagnosis.statistics import AT_NOISE
+from bayessim_mjx.diagnosis.statistics import AT_NOISE, of_one, of_rms
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics import Physics
 
@@ -118,7 +118,7 @@ class Discretisation:
             left = np.max(self.left[known] / self.sigma[known])
             return time_step.REPLACED.format(used=f"{self.integrator} at {used}", left=left)
         finer = time_step.milliseconds(self.timestep / 2 ** int(np.ceil(np.log2(noises))))
-        text = time_step.REDUCES.format(finer="a shorter step" if simulated else f"a step of {finer}")
+        text = time_step.REDUCES.format(finer="A shorter step" if simulated else f"A step of {finer}")
         text += time_step.FINER.format(used=used) if self.factor > 1 else ""
         if simulated:
             return text + time_step.NO_NOISE
@@ -134,6 +134,17 @@ class Discretisation:
         text = f"the simulator cannot be made fine enough: sub-steps of {step:.2g} ms still change the motion"
         text += f" by {self.left[at]:.2g} rad or m at {self.channels[at]}, where {self.limit[at]:.2g} may stay"
         return [f"{text}; smaller gaps are not seen"]
+
+    def in_gap(self, nominal: float, otherwise: float) -> dict[str, float]:
+        """Return the share that the delivered time step makes of the squared gap above the noise, where one is there.
+
+        Args:
+            nominal, otherwise: rms in noise standard deviations as delivered, and as the diagnosis simulates.
+        """
+        if self.delivered is None:
+            return {}
+        closed = 0.0 if of_one(nominal**2).at_noise else of_rms(nominal, otherwise).closed
+        return {"otherwise": otherwise, "share": max(closed, 0.0)}
 
     def to_dict(self) -> dict[str, Any]:
         """For diagnosis.json: numbers by channel, in noise units and physical ones."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 COSTS = (
-    "the simulator's time step of {own} costs {size}{error:.2g} rad or m within a window at {joint}: a gap for every "
-    "policy that is trained with it; "
+    "the simulator's time step of {own} costs {size}{error:.2g} rad or m within a window at {joint}. Every policy that "
+    "is trained with it has this gap. "
 )
-REDUCES = "{finer}, or the integrator RK4 where nothing is in contact, reduces it"
-REPLACED = "the diagnosis simulates by {used}, which leaves {left:.2g} noise standard deviations"
-FINER = "; the diagnosis simulates at {used}"
-COUNTS = "; the rest, {rest:.2g} noise standard deviations, counts as noise"
-NO_NOISE = "; the logs show no noise, so everything smaller than this counts as noise"
+REDUCES = "{finer}, or the integrator RK4 where nothing is in contact, reduces it."
+REPLACED = "The diagnosis simulates by {used}, which leaves {left:.2g} noise standard deviations."
+FINER = " The diagnosis simulates at {used}."
+COUNTS = " The rest, {rest:.2g} noise standard deviations, counts as noise."
+NO_NOISE = " The logs show no noise, so everything smaller than this counts as noise."
 
 
 def milliseconds(seconds: float, integrator: str = "") -> str:

@@ -93,15 +93,15 @@ def _chains(setup: Setup, logs: Array, starts: Sequence[int], length: int) -> wi
     return _cut(setup, setup.physics, each)
 
 
-def _cut(setup: Setup, physics: Physics, starts: list[tuple[int, int]]) -> windows.Windows:
-    """Windows of the setup's length at these (log, row)."""
+def _cut(setup: Setup, physics: Physics, starts: list[tuple[int, int]], many: int = 1) -> windows.Windows:
+    """Windows of the setup's length, or of many of it, at these (log, row)."""
     cut = setup.fitter.simulator.windows
     return windows.cut(
         setup.logs,
         physics.mj_model,
         cut.dt,
         physics.substeps,
-        cut.steps,
+        cut.steps * many,
         limit=len(starts),
         starts=starts,
         centred=False,
@@ -119,8 +119,13 @@ def _simulated(found: Findings, chains: windows.Windows, stages: Sequence[str], 
     thetas, offsets = (np.concatenate(each) for each in zip(*drawn, strict=True))
     chain = np.repeat(np.arange(len(chains)).reshape(len(first), -1), len(thetas) // len(first), axis=0)
     raw = fitter.simulator.run_on(thetas, offsets, chains, chain)
-    raw[np.abs(raw) >= FAR] = np.nan
     raw = raw.reshape(len(first), -1, *raw.shape[1:])
+    step, cut = found.setup.discretisation, fitter.simulator.windows
+    if step is not None and step.delivered is not None:
+        starts = [(int(cut.log[w]), int(cut.start[w])) for w in first]
+        whole = _cut(found.setup, found.setup.physics, starts, chain.shape[1])
+        raw[:, stages.index("nominal")] = step.delivered.played(whole, found.predictions["nominal"].offsets[first])
+    raw[np.abs(raw) >= FAR] = np.nan
     return np.asarray(raw[..., fitter.used] / fitter.sigma)
 
 

@@ -148,7 +148,7 @@ def test_without_noise_the_step_itself_is_the_floor(finer):
     assert found.simulated.all()
     assert (left[min(found.factor, 4)] / found.floor[:2]).max() < 1.2
     assert (left[1] / found.sigma[:2]).max() > 10  # a huge gap, were the floor the sensors' alone
-    assert "no noise" in found.warnings()[0]
+    assert "show no noise" in found.warnings()[0]
 
 
 def test_noise_is_seen_whatever_the_motion():
@@ -243,7 +243,7 @@ def test_the_error_is_that_of_the_delivered_integrator_where_the_diagnosis_has_a
     assert found.worth.own[0] == pytest.approx(3.0 / 2.0 * STEP / 2 * np.sqrt(np.mean(since**2)), rel=0.002)
     assert (found.worth.left[:1] / found.worth.sigma[:1]).max() < 0.01
     (text,) = found.warnings()
-    assert "time step of 5 ms (Euler) costs" in text and "the diagnosis simulates by RK4 at 5 ms, which leaves" in text
+    assert "time step of 5 ms (Euler) costs" in text and "The diagnosis simulates by RK4 at 5 ms, which leaves" in text
 
 
 SERVO = ARM.replace("<motor", '<position kp="9" kv=".4"')
