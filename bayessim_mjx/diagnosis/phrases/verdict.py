@@ -27,12 +27,11 @@ TIME_STEP = (
 )
 CLOSE = " No parameter is clearly off: recalibration leaves {calibrated}."
 STEP_TOO = (
-    "Parameters and the time step are off: recalibrated and simulated by {used}, the simulator reduces the gap from "
-    "{nominal} to {calibrated}."
+    "Parameters and the time step are off: recalibration and {used} reduce the gap from {nominal} to {calibrated}."
 )
-STEP_MAKES = (
-    "The time step of {own} makes {step} of the squared gap as delivered: simulated by {used}, {otherwise} noise sd "
-    "remain without recalibration."
+BOTH_STEPS = (
+    "Before recalibration the gap is {delivered} noise sd at {own} as delivered, and {otherwise} noise sd by {used}. "
+    "All further numbers are by {used}."
 )
 EITHER = (
     "Either the data sheet is wrong, or the cause is {effects}. The probability of a wrong data sheet is {own}. "
@@ -194,7 +193,7 @@ def _fill(d: Diagnosis) -> dict[str, str]:
         "own": f"{1e3 * step.get('timestep', 0.0):.3g} ms ({step.get('delivered')})",
         "used": f"{step.get('integrator')} at {1e3 * step.get('substep', 0.0):.3g} ms",
         "otherwise": number(step.get("otherwise", 0.0)),
-        "step": percent(step.get("share", 0.0)),
+        "delivered": number(far.nominal),
     }
 
 
@@ -216,7 +215,7 @@ def _how_far(d: Diagnosis) -> list[str]:
         out += [LEFT] if loud and not far.beyond and d.verdict != "unexplained" else []
         out += [PROMISED] if finite(far.closed.get("realised")) else []
         out += [ELSEWHERE] if finite(far.closed.get("elsewhere")) else []
-    out += [STEP_MAKES] if _step_shows(d) and not (d.verdict == "no_gap" and advice.time_step(d)) else []
+    out += [BOTH_STEPS] if _step_shows(d) and not (d.verdict == "no_gap" and advice.time_step(d)) else []
     out += [IN_SAMPLE] if far.in_sample else []
     if d.verdict == "unexplained" and not d.effects:
         rest = [_left(n, far.physical[n]) for n in _worst(far) if "largest" in far.physical[n]]
