@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from bayessim_mjx.diagnosis.fitting.simulator import FAR
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.logs.log import Log
+from bayessim_mjx.parameters import Parameter, ParameterSpace
+from bayessim_mjx.parameters.reading import own_value
 from bayessim_mjx.physics import controllers
 
 Array = NDArray[np.float64]
@@ -49,10 +51,15 @@ class Delivered:
         """Time steps in a control step."""
         return round(self.dt / self.model.opt.timestep)
 
-    def plays(self, logs: Sequence[Log]) -> bool:
-        """Whether plain MuJoCo plays these logs: without loops beside the model, drives off, or actuators' memory."""
+    def plays(self, logs: Sequence[Log], space: ParameterSpace) -> bool:
+        """Whether plain MuJoCo plays these logs: without loops beside the model, drives off, or actuators' memory.
+
+        Args:
+            space: of the model's parameters, whose nominal values are to be the model's own.
+        """
         looped = controllers.of_logs(logs, self.model) is not None
-        return not looped and all(log.enabled.all() for log in logs) and not self.model.na
+        plain = not looped and all(log.enabled.all() for log in logs) and not self.model.na
+        return plain and all(np.isclose(p.nominal, _own(self.model, p)) for p in space.parameters)
 
     def step_error(self, cut: Windows, offsets: Array, factor: int) -> Array:
         """Return the error of the time step `[W, H, 2 nv]`, commands held: beside RK4 at steps `factor` times as fine.
@@ -95,6 +102,13 @@ class Delivered:
         found, _ = mujoco.rollout.rollout(model, data, states, ctrl)
         ends = found[:, self.steps - 1 :: self.steps, 1:]
         return _apart(model, cut, ends[..., : model.nq], ends[..., model.nq : model.nq + nv])
+
+
+def _own(model: mujoco.MjModel, p: Parameter) -> float:
+    """Return the value of a parameter that changes nothing."""
+    if p.operation == "absolute":
+        return own_value(model, p.kind, p.attribute, p.target) / p.factor
+    return float(p.operation == "scaling")
 
 
 def _apart(model: mujoco.MjModel, cut: Windows, qpos: Array, qvel: Array) -> Array:

@@ -142,7 +142,7 @@ def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, lef
     model = copy.copy(robot.mj_model)
     model.opt.timestep = own.mj_model.opt.timestep
     as_is = Delivered(model, dt)
-    delivered = as_is if more and not stable.joint and as_is.plays(logs) else None
+    delivered = as_is if more and not stable.joint and as_is.plays(logs, robot.space) else None
     cuts, worth = measured(better.physics(dt, gains), first=stable.factor, delivered=delivered)
     if not more or worth.errors is None or worth.errors.seconds < left:
         return Choice(better, stable, cuts, worth)

@@ -20,6 +20,7 @@ from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
 from bayessim_mjx.diagnosis.setup import _measured
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
+from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import native
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
@@ -284,7 +285,20 @@ def test_commands_through_a_loop_or_a_drive_that_is_off_are_not_plain_mujocos(ch
     streams = {"enabled:a": np.zeros(20)} if change == "off" else {}
     given = Delivered(the(ARM).mj_model, PERIOD)
     named = dataclasses.replace(log, metadata=metadata, streams=streams)
-    assert given.plays([log]) and not given.plays([log, named])
+    space = the(ARM).space
+    assert given.plays([log], space) and not given.plays([log, named], space)
+
+
+@pytest.mark.parametrize(
+    ("operation", "own", "other"), [("scaling", 1.0, 1.2), ("additive", 0.0, 0.1), ("absolute", 0.03, 0.06)]
+)
+def test_parameters_whose_nominal_values_are_not_the_models_are_not_plain_mujocos(operation, own, other):
+    given = Delivered(the(ARM).mj_model, PERIOD)
+    for nominal in (own, other):
+        known = Parameter(
+            "d", nominal, 0.0, 2.0, operation=operation, attribute="damping", target="elbow", kind="joint"
+        )
+        assert given.plays([], ParameterSpace([known])) == (nominal == own)
 
 
 def test_where_time_is_limited_the_integrator_stays_unless_a_search_by_the_better_one_fits():
