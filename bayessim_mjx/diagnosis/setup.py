@@ -77,6 +77,11 @@ class Setup:
     def logs(self) -> tuple[Log, ...]:
         return self.gate.usable
 
+    @property
+    def delivered(self) -> Delivered | None:
+        """The model as delivered, where it is simulated by another integrator."""
+        return self.discretisation.delivered if self.discretisation else None
+
 
 def control_period(robot: Robot, logs: Sequence[Log]) -> float:
     """s: the task's, else the logs' own, or a multiple of it that is not too short to simulate."""

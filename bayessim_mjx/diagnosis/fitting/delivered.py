@@ -14,6 +14,7 @@ import mujoco.rollout
 import numpy as np
 from numpy.typing import NDArray
 
+from bayessim_mjx.diagnosis.fitting import windows
 from bayessim_mjx.diagnosis.fitting.simulator import FAR
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.logs.log import Log
@@ -81,6 +82,20 @@ class Delivered:
         count, length, fine, nu = command.shape
         means = command.reshape(count, length, self.steps, fine // self.steps, nu).mean(3)
         return self.errors(cut, means, offsets[:, : 2 * self.model.nv])
+
+    def recorded(
+        self, starts: list[tuple[int, int]], cut: Windows, logs: Sequence[Log], moved: float, many: int = 1
+    ) -> Windows:
+        """Return windows with commands as they were recorded.
+
+        Args:
+            starts: (log, row); cut: windows of a length, which these have, or many of it.
+            logs: of the windows, whose commands were moved by so many s.
+        """
+        given, length = [log.shifted(-moved) for log in logs], cut.steps * many
+        return windows.cut(
+            given, self.model, cut.dt, self.steps, length, limit=len(starts), starts=starts, centred=False
+        )
 
     def errors(self, cut: Windows, command: Array, offsets: Array) -> Array:
         """Measured minus simulated `[W, H, 2 nv]`.

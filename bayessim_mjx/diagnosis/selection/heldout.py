@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +17,7 @@ from bayessim_mjx.diagnosis.fitting.delivered import Delivered
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES as HELD_OUT
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
+from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.selection.models import Model, told_alone
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import Gap
@@ -126,11 +128,17 @@ def noise_floor(fit: Fit, noise: Array) -> Array:
     return np.asarray(square.mean() - twice / len(square))
 
 
-def nominal(fitter: Fitter, fit: Fit, delivered: Delivered | None = None) -> Prediction:
-    """Simulate as delivered, starts estimated; delivered: the model, where the fitter has another integrator."""
+def nominal(fitter: Fitter, fit: Fit, delivered: Delivered | None = None, cuts: Sequence[Windows] = ()) -> Prediction:
+    """Simulate as delivered, starts estimated.
+
+    Args:
+        delivered: the model, where the fitter has another integrator; cuts: windows with the commands that may be
+            meant, of which the nearest count.
+    """
     cut = fitter.simulator.windows
     if delivered is not None:
-        return _settled(fitter, fit, lambda offsets: delivered.played(cut, offsets))
+        played = [functools.partial(delivered.played, own) for own in (cut, *cuts)]
+        return min((_settled(fitter, fit, errors) for errors in played), key=lambda p: float(np.sum(p.error**2)))
     theta = fitter.vector(fit.coordinates, np.array([c.neutral for c in fit.coordinates]))
     each = theta[None], np.zeros(len(cut), int), np.arange(len(cut))
     return _settled(fitter, fit, lambda offsets: fitter.simulator.run_each(*each, offsets))
