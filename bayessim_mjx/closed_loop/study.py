@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import copy
 import dataclasses
 import json
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from bayessim_mjx.closed_loop.policies import Keeper, Policies
 from bayessim_mjx.config import Config, freeze
 from bayessim_mjx.diagnosis import result
 from bayessim_mjx.diagnosis.correction import correction as correction_of
+from bayessim_mjx.diagnosis.correction import stepping_of
 from bayessim_mjx.diagnosis.fitting import discretisation, robot
 from bayessim_mjx.effects.support import storage
 from bayessim_mjx.errors import UserError
@@ -75,6 +77,16 @@ def _refined(body: robot.Robot, timestep: float | None, flag: str) -> robot.Robo
     if not 0 < timestep <= most:
         raise UserError(f"{flag} {timestep:g}: must be positive and at most the task's own, {most:g} s")
     return discretisation.refined(body, timestep)
+
+
+def _integrated(body: robot.Robot, diagnosis: result.Diagnosis) -> robot.Robot:
+    """Give the robot the integrator by which a diagnosis simulated."""
+    found = stepping_of(diagnosis)
+    if found is None:
+        return body
+    model = copy.copy(body.mj_model)
+    model.opt.integrator = found.number
+    return dataclasses.replace(body, mj_model=model)
 
 
 def diagnosed_timestep(diagnosis: result.Diagnosis) -> float | None:
@@ -248,7 +260,7 @@ def make(args: argparse.Namespace, config: Config) -> Study:
     step = args.timestep
     if step is None and (found := diagnosed_timestep(diagnosis)) is not None:
         step = min(found, float(body.mj_model.opt.timestep))
-    finer = _refined(body, step, "--timestep")
+    finer = _integrated(_refined(body, step, "--timestep"), diagnosis)
     physics = _corrected(finer, dt, correction(diagnosis, folder, body.space), f"--diagnosis {folder}")
     nominal = _on(config, body.physics(dt, (), judge.wide(body.space)))
     real = logs = None

@@ -2,6 +2,7 @@
 
 import dataclasses
 import typing
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ SECTIONS: dict[str, type[Section]] = {
 TOP_KEYS = [YAML_NAMES.get(f.name, f.name) for f in dataclasses.fields(Config)]
 REAL_KEYS = ("weights", "means", "stds")
 EFFECTS_SCHEMA = 1
-EFFECTS_KEYS = ("schema", "effects", "calibrated")
+EFFECTS_KEYS = ("schema", "effects", "calibrated", "simulated")
 TASK_KEYS = ("randomize", "randomization_params")
 PARAMS = "task.randomization_params"
 NEW_GROUPS = ("option", "effects")  # which an override may add; what is in `effects` is for the effects to check
@@ -94,7 +95,9 @@ def _with_effects(raw: Mapping[str, Any], source: str, is_file: bool) -> Mapping
         raise UserError(
             f"effects = {effects!r} ({source}): no such file; expected an effects.yaml or a list of {{effect, where}}"
         )
-    return {**raw, **read_effects(effects)}
+    found = read_effects(effects)
+    _note_stepping(effects)
+    return {**raw, **found}
 
 
 def _merge_section(
@@ -181,7 +184,16 @@ def read_effects(path: str | Path) -> dict[str, Any]:
         raise UserError(
             f"{path}: schema = {raw.get('schema')!r}: expected schema: {EFFECTS_SCHEMA}, as a diagnosis writes"
         )
-    return {key: raw.get(key) or [] for key in EFFECTS_KEYS[1:]}
+    return {key: raw.get(key) or [] for key in EFFECTS_KEYS[1:3]}
+
+
+def _note_stepping(path: str) -> None:
+    """Warn where the numbers of an effects.yaml belong to another integrator or time step than a model was given."""
+    found = read_yaml(path).get("simulated")
+    if isinstance(found, Mapping):
+        option = " ".join(f'{key}="{found.get(key)}"' for key in ("integrator", "timestep"))
+        text = f"effects = {path}: the diagnosis simulated with <option {option}/>, and its errors hold for that"
+        warnings.warn(f"{text}; set it in the task's model, which keeps its own integrator and time step", stacklevel=2)
 
 
 def _merge_task(merged: dict, raw: Mapping, source: str, is_file: bool) -> None:

@@ -5,11 +5,13 @@ Only names, places and estimates are read, so a diagnosis loaded from its folder
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+import mujoco
 import numpy as np
 
 from bayessim_mjx import effects as library
@@ -97,6 +99,37 @@ class Found(Protocol):
     def covariance(self) -> dict[str, Any]: ...
     @property
     def details(self) -> dict[str, Any]: ...
+    @property
+    def gap(self) -> Any: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Stepping:
+    """How a diagnosis simulated, where that is not as the model was delivered.
+
+    Attributes:
+        integrator, timestep: name in an MJCF, and s. own, own_step: the delivered ones.
+    """
+
+    integrator: str
+    timestep: float
+    own: str
+    own_step: float
+
+    @property
+    def number(self) -> int:
+        """MuJoCo's, of the integrator."""
+        return int(getattr(mujoco.mjtIntegrator, f"mjINT_{self.integrator.upper()}"))
+
+
+def stepping_of(diagnosis: Found) -> Stepping | None:
+    """Return how it simulated; None where that is as delivered, or not known (files of before)."""
+    step = diagnosis.gap.integrator
+    if "delivered" not in step:
+        return None
+    found = Stepping(step["integrator"], step["substep"], step["delivered"], step["timestep"])
+    same = found.integrator == found.own and found.timestep > found.own_step * (1 - quantities.EXACT)
+    return None if same else found
 
 
 def effects_of(diagnosis: Found) -> tuple[Effect, ...]:
@@ -187,6 +220,8 @@ def _number(value: float | None) -> float:
 def apply(diagnosis: Found, physics: Physics) -> Physics:
     """Return the corrected simulator: the same model and control step; nominal values are the identified ones.
 
+    Its integrator and its time step are those by which the diagnosis simulated: errors of others were not measured.
+
     Args:
         physics: with the known parameters as its `model_space`; its effects are replaced by those found.
 
@@ -195,7 +230,18 @@ def apply(diagnosis: Found, physics: Physics) -> Physics:
     """
     limit = None if physics.max_qvel is None else physics.max_qvel.tolist()
     space = calibrated_of(diagnosis, physics.model_space)
-    return Physics(physics.mj_model, physics.dt, space, effects_of(diagnosis), limit)
+    return Physics(_stepping(physics, stepping_of(diagnosis)), physics.dt, space, effects_of(diagnosis), limit)
+
+
+def _stepping(physics: Physics, found: Stepping | None) -> mujoco.MjModel:
+    """Return the model with an integrator, and a time step that is no longer and divides the control step."""
+    if found is None:
+        return physics.mj_model
+    model = copy.copy(physics.mj_model)
+    step = min(found.timestep, float(model.opt.timestep))
+    model.opt.integrator = found.number
+    model.opt.timestep = physics.dt / math.ceil(physics.dt / step - quantities.EXACT)
+    return model
 
 
 def prior(diagnosis: Found, physics: Physics | ParameterSpace | None = None) -> Distribution:

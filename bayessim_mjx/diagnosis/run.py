@@ -42,8 +42,11 @@ from bayessim_mjx.logs.log import Log
 def how_far(found: Findings, say: Progress) -> Findings:
     """Add the held-out motion of the simulator as delivered, recalibrated and with the effects."""
     fitter, base, model = found.setup.fitter, found.selection.state.base, found.model
+    delivered, moved, cut = found.setup.delivered, found.setup.gate.timing.moved, fitter.simulator.windows
+    starts = list(zip(cut.log.tolist(), cut.start.tolist(), strict=True))
+    meant = [delivered.recorded(starts, cut, found.setup.logs, moved)] if delivered and moved else []
     predictions = {
-        "nominal": heldout.nominal(fitter, found.selection.state.nominal),
+        "nominal": heldout.nominal(fitter, found.selection.state.nominal, delivered, meant),
         "calibrated": heldout.predict(fitter, base),
     }
     predictions["with_effects"] = heldout.predict(fitter, model) if model.effects else predictions["calibrated"]

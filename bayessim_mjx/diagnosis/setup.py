@@ -21,6 +21,7 @@ from bayessim_mjx.diagnosis.fitting import (
     scales,
 )
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING, windows_of
+from bayessim_mjx.diagnosis.fitting.delivered import Delivered
 from bayessim_mjx.diagnosis.fitting.fitter import Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES
 from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts, pruned
@@ -75,6 +76,11 @@ class Setup:
     @property
     def logs(self) -> tuple[Log, ...]:
         return self.gate.usable
+
+    @property
+    def delivered(self) -> Delivered | None:
+        """The model as delivered, where it is simulated by another integrator."""
+        return self.discretisation.delivered if self.discretisation else None
 
 
 def control_period(robot: Robot, logs: Sequence[Log]) -> float:
@@ -220,19 +226,21 @@ def _measured(
     use_qvel: bool,
     limit: Array | None,
     first: int = 1,
+    delivered: Delivered | None = None,
 ) -> tuple[Callable[..., Windows], discretisation.Discretisation]:
     """Return the windows and the error of the time step in them; shorter ones where contacts make it large.
 
     Args:
         limit: `[nv]`, the tolerance; None: none is known.
         first: the coarsest factor on the sub-steps that is stable: as many windows fewer are looked at.
+        delivered: the model, where `own` has another integrator.
     """
     seconds = CUTTING.window
     while True:
         cuts = windows_of(own, usable, group, use_qvel, seconds, first)
         steps = cuts(1).steps
         fine = CUTTING.finest(own, len(cuts(1)), steps)
-        step = discretisation.measure(own, cuts, usable, fine, first=first, limit=limit)
+        step = discretisation.measure(own, cuts, usable, fine, first=first, limit=limit, delivered=delivered)
         if not (contacts(own) and step.lottery) or steps == RULES.parts:
             return cuts, step
         seconds /= 2

@@ -5,7 +5,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayessim_mjx.diagnosis.phrases.advice import MODEL, command, headline, purpose, verdict_of
+from bayessim_mjx.diagnosis.correction import stepping_of
+from bayessim_mjx.diagnosis.phrases import time_step
+from bayessim_mjx.diagnosis.phrases.advice import command, headline, purpose, verdict_of
 from bayessim_mjx.diagnosis.phrases.effects import candidate_title, capital, titled
 from bayessim_mjx.diagnosis.phrases.residual import parted
 from bayessim_mjx.diagnosis.phrases.size import below_tiles, no_help, with_effects
@@ -99,11 +101,11 @@ def about(d: Diagnosis) -> list[str]:
 def simulated(d: Diagnosis) -> str:
     """Return step and integrator of the errors, and what the user stated: short phrases."""
     a, parts = d.about, []
-    step, own = (float(a.get(key) or math.nan) for key in ("timestep", "model_timestep"))
+    step = float(a.get("timestep") or math.nan)
     if finite(step):
-        parts.append(f"errors at time steps of {number(1e3 * step)} ms ({a.get('integrator')})")
-        coarser = finite(own) and own > 1.01 * step and d.effects
-        parts += [f"{MODEL} steps {number(1e3 * own)} ms, where the error may be larger"] if coarser else []
+        other = stepping_of(d)
+        own = f", in place of the model's {time_step.milliseconds(other.own_step, other.own)}" if other else ""
+        parts.append(f"errors at time steps of {number(1e3 * step)} ms ({a.get('integrator')}){own}")
     parts += [f"--{flag} {' '.join(texts)}" for flag, texts in (a.get("stated") or {}).items() if texts]
     return capital("; ".join(parts))
 

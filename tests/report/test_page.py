@@ -305,10 +305,13 @@ def test_a_robot_of_one_joint_has_no_table_of_shares(tmp_path):
     assert f"All of it is at {whole.where[0].channel}" in page.text and "share of the squared gap" not in page.text
 
 
-@pytest.mark.parametrize(("own", "said"), [(0.002, True), (0.0005, False)])
+@pytest.mark.parametrize(("own", "said"), [("implicitfast", True), ("RK4", False)])
 def test_the_page_has_the_time_step_of_the_errors_and_what_was_stated(own, said, tmp_path):
-    """A model whose own step is coarser has a larger error than the one that is reported."""
-    about = {"timestep": 5e-4, "integrator": "IMPLICITFAST", "model_timestep": own, "stated": {"accuracy": ["5%"]}}
-    text = rendered(dataclasses.replace(fake.full(), about=about), tmp_path).text
-    assert "Errors at time steps of 0.5" in text and "(IMPLICITFAST)" in text and "--accuracy 5%" in text
-    assert ("model_with_effects.xml steps 2" in text) == said
+    """A model with another integrator has another error than the one that is reported."""
+    about = {"timestep": 5e-4, "integrator": "RK4", "stated": {"accuracy": ["5%"]}}
+    whole = fake.full()
+    step = whole.gap.integrator | {"timestep": 5e-4, "substep": 5e-4, "integrator": "RK4", "delivered": own}
+    gap = dataclasses.replace(whole.gap, integrator=step)
+    text = rendered(dataclasses.replace(whole, about=about, gap=gap), tmp_path).text
+    assert "Errors at time steps of 0.5" in text and "(RK4)" in text and "--accuracy 5%" in text
+    assert ("in place of the model's 0.5 ms (implicitfast)" in text) == said

@@ -18,11 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting import quadratic
+from bayessim_mjx.diagnosis.fitting.delivered import INTEGRATORS, Delivered
 from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
-from bayessim_mjx.diagnosis.statistics import AT_NOISE
+from bayessim_mjx.diagnosis.phrases import time_step
+from bayessim_mjx.diagnosis.statistics import AT_NOISE, of_one, of_rms
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics import Physics
 
@@ -49,13 +51,14 @@ class Discretisation:
     Attributes:
         timestep: s, the model's; factor: sub-steps of the diagnosis are `timestep / factor`.
         order: of convergence, log2 of what halving the sub-step gains.
-        own: error of the simulator as it is (commands held, no correction) from the same starts.
+        own: error of the simulator as delivered (commands held, no correction) from the same starts.
         settled: and after the start states have adapted; left: of the diagnosis' sub-steps, likewise adapted.
         sigma: noise of the logs; floor: what the diagnosis takes for noise.
         simulated: `[nv]`, channels that show no noise at all: logs of a simulation.
         channels: names `[nv]`.
         errors: the windows simulated without effects, for what else is asked of them.
         limit: `[nv]`, the tolerance, rad or m; None: none is known.
+        integrator: of the diagnosis; delivered: the model, where the diagnosis has another integrator.
     """
 
     timestep: float
@@ -70,6 +73,8 @@ class Discretisation:
     channels: tuple[str, ...]
     errors: Errors | None = None
     limit: Array | None = None
+    integrator: str = ""
+    delivered: Delivered | None = None
 
     def robot(self, robot: Robot) -> Robot:
         """Return the robot at the sub-steps of the diagnosis."""
@@ -103,23 +108,22 @@ class Discretisation:
             return []
         at = int(np.argmax(noises))
         size = "" if self.simulated[at] else f"{noises[at]:.1f} noise standard deviations, "
-        text = (
-            f"the simulator's time step of {1e3 * self.timestep:.3g} ms costs {size}{self.own[at]:.2g} rad "
-            f"or m within a window at {self.channels[at]}: a gap for every policy that is trained with it; "
-        )
+        own = time_step.milliseconds(self.timestep, self.delivered.integrator if self.delivered else "")
+        text = time_step.COSTS.format(own=own, size=size, error=self.own[at], joint=self.channels[at])
         return [text + self._remedy(noises[at], bool(self.simulated[at]))]
 
     def _remedy(self, noises: float, simulated: bool) -> str:
-        finer = 1e3 * self.timestep / 2 ** int(np.ceil(np.log2(noises)))
-        other = "a shorter step" if simulated else f"a step of {finer:.2g} ms"
-        text = f"{other}, or the integrator RK4 where nothing is in contact, reduces it"
-        if self.factor > 1:
-            text += f"; the diagnosis simulates at {1e3 * self.timestep / self.factor:.3g} ms"
+        known, used = np.isfinite(self.sigma), time_step.milliseconds(self.timestep / self.factor)
+        if self.delivered is not None:
+            left = np.max(self.left[known] / self.sigma[known])
+            return time_step.REPLACED.format(used=f"{self.integrator} at {used}", left=left)
+        finer = time_step.milliseconds(self.timestep / 2 ** int(np.ceil(np.log2(noises))))
+        text = time_step.REDUCES.format(finer="A shorter step" if simulated else f"A step of {finer}")
+        text += time_step.FINER.format(used=used) if self.factor > 1 else ""
         if simulated:
-            return f"{text}; the logs show no noise, so everything smaller than this counts as noise"
-        known = np.isfinite(self.sigma)
+            return text + time_step.NO_NOISE
         left = np.sqrt(np.maximum((self.floor[known] / self.sigma[known]) ** 2 - 1, 0.0)).max()
-        return f"{text}; the rest, {left:.2g} noise standard deviations, counts as noise" if left > ENOUGH else text
+        return text + time_step.COUNTS.format(rest=left) if left > ENOUGH else text
 
     def beyond(self) -> list[str]:
         """In words, where no step that can be afforded is fine enough: to be told before anything is fitted."""
@@ -131,6 +135,17 @@ class Discretisation:
         text += f" by {self.left[at]:.2g} rad or m at {self.channels[at]}, where {self.limit[at]:.2g} may stay"
         return [f"{text}; smaller gaps are not seen"]
 
+    def in_gap(self, nominal: float, otherwise: float) -> dict[str, float]:
+        """Return the share that the delivered time step makes of the squared gap above the noise, where one is there.
+
+        Args:
+            nominal, otherwise: rms in noise standard deviations as delivered, and as the diagnosis simulates.
+        """
+        if self.delivered is None:
+            return {}
+        closed = 0.0 if of_one(nominal**2).at_noise else of_rms(nominal, otherwise).closed
+        return {"otherwise": otherwise, "share": max(closed, 0.0)}
+
     def to_dict(self) -> dict[str, Any]:
         """For diagnosis.json: numbers by channel, in noise units and physical ones."""
         nv = len(self.channels)
@@ -141,6 +156,8 @@ class Discretisation:
         return {
             "timestep": self.timestep,
             "substep": self.timestep / self.factor,
+            "integrator": self.integrator,
+            "delivered": self.delivered.integrator if self.delivered else self.integrator,
             "order": self.order,
             "noises": by(self.own[:nv] / self.sigma[:nv]),
             "physical": by(self.own[:nv]),
@@ -166,6 +183,7 @@ def measure(
     *,
     first: int = 1,
     limit: Array | None = None,
+    delivered: Delivered | None = None,
 ) -> Discretisation:
     """Return the errors of `physics` (without effects) in the windows, and the sub-steps for the diagnosis.
 
@@ -175,6 +193,7 @@ def measure(
         most: the finest factor that can be afforded.
         first: the coarsest factor that is stable.
         limit: `[nv]`, the tolerance, rad or m.
+        delivered: the model, where `physics` has another integrator.
     """
     start, factors = cuts(first), [first * f for f in FACTORS]
     touching = contacts(physics)
@@ -187,16 +206,17 @@ def measure(
     one, two = settle(coarse - mid), settle(mid - fine)
     gain = _gain(one / sigma, two / sigma)
     truth = fine if touching else fine + (fine - mid) / max(gain - 1, 1.0)
+    off = plain - truth if delivered is None else delivered.step_error(start, errors.offsets, factors[-1])
     worth = _size(one, touching) * _all(gain, touching)
     at = {f: worth / gain**k for k, f in enumerate(factors)}
-    settled = _size(settle(plain - truth), touching)
+    settled = _size(settle(off), touching)
     base = np.hypot(sigma, np.tile(clean, 2) * settled)  # who simulated such logs may have used this step or another
     factor = _choose({f: float(np.max(at[f] / base)) for f in factors if f <= max(first, most)})
     return Discretisation(
         timestep=float(physics.mj_model.opt.timestep),
         factor=factor,
         order=float(np.log2(gain)),
-        own=_size(plain - truth, touching),
+        own=_size(off, touching),
         settled=settled,
         left=at[factor],
         sigma=sigma,
@@ -205,6 +225,8 @@ def measure(
         channels=Channels.of(physics.mj_model).qvel,
         errors=errors,
         limit=limit,
+        integrator=INTEGRATORS[int(physics.mj_model.opt.integrator)],
+        delivered=delivered,
     )
 
 

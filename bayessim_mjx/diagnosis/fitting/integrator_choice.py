@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
+from bayessim_mjx.diagnosis.fitting.delivered import INTEGRATORS, Delivered
 from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, simulated
 from bayessim_mjx.diagnosis.fitting.observation import Stepper
 from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts
@@ -35,7 +36,6 @@ GAINS = (ServoStiffness, ServoDamping)  # kp and kv: a servo's least known numbe
 Measured = Callable[..., tuple[Any, Discretisation]]
 TOO_LONG = "the model's time step shows beside the noise, and in the time given nothing finer can be searched with"
 RK4, IMPLICITFAST = int(mujoco.mjtIntegrator.mjINT_RK4), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
-NAMES = {RK4: "RK4", IMPLICITFAST: "implicitfast"}
 FINEST = 64  # sub-steps per step of the model that are tried; a rule of thumb
 
 
@@ -77,7 +77,7 @@ class Step:
         if not self.reached:
             mend = "more armature or damping, or a softer loop, at this joint would"
             return [f"{text}, and for {finer:.3g} ms too; no gap can be trusted there ({mend})"]
-        how = f" by the integrator {NAMES[self.integrator]}" if self.changed else ""
+        how = f" by the integrator {INTEGRATORS[self.integrator]}" if self.changed else ""
         return [f"{text}; the diagnosis simulates at {finer:.3g} ms or less{how}"]
 
 
@@ -138,9 +138,12 @@ def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, lef
     precise = not contacts(own) and not simulated(own.mj_model, logs).all()
     robot = dataclasses.replace(robot, rubbing=rubbing(robot.mj_model) if precise else ())
     stable = coarsest_stable(own.mj_model, logs, precise)
-    better = stable.robot(robot)
-    cuts, worth = measured(better.physics(dt, gains), first=stable.factor)
-    more = stable.changed and stable.integrator == RK4
+    better, more = stable.robot(robot), stable.changed and stable.integrator == RK4
+    model = copy.copy(robot.mj_model)
+    model.opt.timestep = own.mj_model.opt.timestep
+    as_is = Delivered(model, dt)
+    delivered = as_is if more and not stable.joint and as_is.plays(logs, robot.space) else None
+    cuts, worth = measured(better.physics(dt, gains), first=stable.factor, delivered=delivered)
     if not more or worth.errors is None or worth.errors.seconds < left:
         return Choice(better, stable, cuts, worth)
     stable = coarsest_stable(own.mj_model, logs)

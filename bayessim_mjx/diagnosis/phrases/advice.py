@@ -88,6 +88,11 @@ EITHER = replace(
     advice="Measure a part, such as a link's mass, and state it with --accuracy. Then diagnose again. Until then, "
     "randomise widely: effects.yaml holds one of the explanations.",
 )
+TIME_STEP = replace(
+    VERDICTS["no_gap"],
+    advice=f"Train with the integrator and the time step of the diagnosis: {MODEL} has them. These logs need no "
+    "effect.",
+)
 PARTLY = Verdict(
     "Partly explained",
     "The named effects leave more of the gap than the tolerance.",
@@ -116,6 +121,8 @@ def verdict_of(d: Diagnosis) -> Verdict:
         return ALIKE if d.next_experiment else UNSOUGHT
     if d.verdict == "insufficient_data" and not d.warnings:
         return LONGER
+    if d.verdict == "no_gap" and time_step(d):
+        return TIME_STEP
     if d.verdict == "parameters" and stand_ins(d.parameters):
         return EITHER
     if d.verdict == "effects" and lacks(d):
@@ -124,6 +131,11 @@ def verdict_of(d: Diagnosis) -> Verdict:
     found = LITTLE if little(d) else found
     looked = d.where or d.next_experiment  # the stages that a short diagnosis leaves out
     return found if looked else replace(found, advice=found.advice.replace(BELOW, NOT_BELOW))
+
+
+def time_step(d: Diagnosis) -> bool:
+    """Whether the time step of the delivered simulator makes most of its squared gap."""
+    return bool(d.gap.integrator.get("share", 0.0) > 0.5)
 
 
 def little(d: Diagnosis) -> bool:
@@ -164,7 +176,7 @@ def command(d: Diagnosis, folder: str | Path) -> str:
     elif lacks(d):
         return ""
     else:
-        shown = model if d.verdict == "no_gap" else out / MODEL
+        shown = model if d.verdict == "no_gap" and not time_step(d) else out / MODEL
         said = ["python", "-m", "mujoco.viewer", f"--mjcf={shown}"]
     return shlex.join(said)
 

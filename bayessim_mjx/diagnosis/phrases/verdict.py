@@ -21,6 +21,18 @@ HEADS = {
     "simulator, {calibrated}.",
     "unexplained": "No effect of the library explains the gap: recalibration leaves {calibrated}.",
 }
+TIME_STEP = (
+    "No gap but the time step: at {own} the simulator as delivered differs from the logs by {nominal}. Simulated by "
+    "{used} it differs by {otherwise} noise sd."
+)
+CLOSE = " No parameter is clearly off: recalibration leaves {calibrated}."
+STEP_TOO = (
+    "Parameters and the time step are off: recalibration and {used} reduce the gap from {nominal} to {calibrated}."
+)
+BOTH_STEPS = (
+    "Before recalibration the gap is {delivered} noise sd at {own} as delivered, and {otherwise} noise sd by {used}. "
+    "All further numbers are by {used}."
+)
 EITHER = (
     "Either the data sheet is wrong, or the cause is {effects}. The probability of a wrong data sheet is {own}. "
     "To separate them, measure {parameters} and state the accuracy (--accuracy). Recalibration reduces the gap "
@@ -122,6 +134,9 @@ def _head(d: Diagnosis) -> str:
         quoted = {"no_gap": far.nominal, "parameters": far.calibrated}.get(d.verdict)
         above = quoted is not None and not of_one(quoted**2).at_noise
         head = HEADS["no_gap"].partition(": ")[2] if above and d.verdict == "no_gap" else HEADS[d.verdict]
+        if d.verdict == "no_gap" and advice.time_step(d):
+            head, above = TIME_STEP + CLOSE * (not of_one(far.integrator["otherwise"] ** 2).at_noise), False
+        head = STEP_TOO if d.verdict == "parameters" and _step_shows(d) else head
         known = d.parameters if d.verdict == "parameters" else {}
         instead = parameters.stand_ins(known)
         far_off = [] if instead else parameters.far_from_model(known)
@@ -144,6 +159,11 @@ def _head(d: Diagnosis) -> str:
     return " ".join([*parts, *([REST.format(**fill)] if far.beyond else [])])
 
 
+def _step_shows(d: Diagnosis) -> bool:
+    """Whether the delivered time step makes a relevant share of the squared gap."""
+    return bool(d.gap.integrator.get("share", 0.0) > RELEVANCE.share)
+
+
 def _acts(d: Diagnosis) -> str:
     """Return the place of a force that is missing beside all effects; "" where none predicts the residual."""
     force = d.basis.get("flexible") or {}
@@ -153,7 +173,7 @@ def _acts(d: Diagnosis) -> str:
 
 def _fill(d: Diagnosis) -> dict[str, str]:
     """Numbers and forms of words that texts have places for."""
-    far, one = d.gap, len(d.effects) == 1
+    far, one, step = d.gap, len(d.effects) == 1, d.gap.integrator
     worst = _worst(far)
     return {s: stage(far, s) for s in ("nominal", "calibrated", "with_effects")} | {
         "them": "it" if one else "them",
@@ -170,6 +190,10 @@ def _fill(d: Diagnosis) -> dict[str, str]:
         "leave": "leaves" if one else "leave",
         "rest": percent(of_rms(far.calibrated, far.with_effects).left),
         **{k: percent(max(v, 0.0)) for k, v in far.closed.items() if k in SHARES and finite(v)},
+        "own": f"{1e3 * step.get('timestep', 0.0):.3g} ms ({step.get('delivered')})",
+        "used": f"{step.get('integrator')} at {1e3 * step.get('substep', 0.0):.3g} ms",
+        "otherwise": number(step.get("otherwise", 0.0)),
+        "delivered": number(far.nominal),
     }
 
 
@@ -191,6 +215,7 @@ def _how_far(d: Diagnosis) -> list[str]:
         out += [LEFT] if loud and not far.beyond and d.verdict != "unexplained" else []
         out += [PROMISED] if finite(far.closed.get("realised")) else []
         out += [ELSEWHERE] if finite(far.closed.get("elsewhere")) else []
+    out += [BOTH_STEPS] if _step_shows(d) and not (d.verdict == "no_gap" and advice.time_step(d)) else []
     out += [IN_SAMPLE] if far.in_sample else []
     if d.verdict == "unexplained" and not d.effects:
         rest = [_left(n, far.physical[n]) for n in _worst(far) if "largest" in far.physical[n]]

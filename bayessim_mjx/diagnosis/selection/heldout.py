@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,9 +13,11 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from bayessim_mjx.diagnosis import statistics
+from bayessim_mjx.diagnosis.fitting.delivered import Delivered
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import RULES as HELD_OUT
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate, solve
+from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.selection.models import Model, told_alone
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, RELEVANCE
 from bayessim_mjx.diagnosis.statistics import Gap
@@ -41,7 +45,8 @@ def predict(fitter: Fitter, model: Model) -> Prediction:
     """Simulate each condition's windows with the parameters found without it; starts re-estimated on the window."""
     _, fold = np.unique(fitter.simulator.windows.group, return_inverse=True)
     thetas = [fitter.vector(model.fit.coordinates, values) for values in model.estimates]
-    return _settled(fitter, model.fit, np.array(thetas), fold)
+    each = np.array(thetas), fold, np.arange(len(fold))
+    return _settled(fitter, model.fit, lambda offsets: fitter.simulator.run_each(*each, offsets))
 
 
 def refitted(fitter: Fitter, model: Model) -> Model:
@@ -123,25 +128,30 @@ def noise_floor(fit: Fit, noise: Array) -> Array:
     return np.asarray(square.mean() - twice / len(square))
 
 
-def nominal(fitter: Fitter, fit: Fit) -> Prediction:
-    """Simulate as delivered, starts estimated."""
+def nominal(fitter: Fitter, fit: Fit, delivered: Delivered | None = None, cuts: Sequence[Windows] = ()) -> Prediction:
+    """Simulate as delivered, starts estimated.
+
+    Args:
+        delivered: the model, where the fitter has another integrator; cuts: windows with the commands that may be
+            meant, of which the nearest count.
+    """
+    cut = fitter.simulator.windows
+    if delivered is not None:
+        played = [functools.partial(delivered.played, own) for own in (cut, *cuts)]
+        return min((_settled(fitter, fit, errors) for errors in played), key=lambda p: float(np.sum(p.error**2)))
     theta = fitter.vector(fit.coordinates, np.array([c.neutral for c in fit.coordinates]))
-    return _settled(fitter, fit, theta[None], np.zeros(len(fit.r), int))
+    each = theta[None], np.zeros(len(cut), int), np.arange(len(cut))
+    return _settled(fitter, fit, lambda offsets: fitter.simulator.run_each(*each, offsets))
 
 
-def _settled(fitter: Fitter, fit: Fit, thetas: Array, of_theta: NDArray[np.int64]) -> Prediction:
-    """All windows after two Newton steps of their start states; thetas: `[g, P]`; of_theta: `[W]`, a window's."""
-    own = of_theta, np.arange(len(of_theta))
-
-    def simulated(offsets: Array) -> Array:
-        return fitter.whiten(fitter.simulator.run_each(thetas, *own, offsets))
-
+def _settled(fitter: Fitter, fit: Fit, errors: Callable[[Array], Array]) -> Prediction:
+    """All windows after two Newton steps of their start states; errors: changes of these `[W, s]` -> `[W, H, 2 nv]`."""
     offsets, none = fit.offsets, np.zeros((*fit.r.shape, 0))
-    r = simulated(offsets)
+    r = fitter.whiten(errors(offsets))
     for _ in range(2):
         _, starts = eliminate(r, none, fit.B, offsets, fit.spread)
         moved = offsets + starts.step(none, np.zeros(0))
-        new = simulated(moved)
+        new = fitter.whiten(errors(moved))
         better = (np.sum(new**2, 1) < np.sum(r**2, 1))[:, None]
         r, offsets = np.where(better, new, r), np.where(better, moved, offsets)
     return Prediction(r.reshape(len(r), fitter.simulator.windows.steps, -1), offsets)

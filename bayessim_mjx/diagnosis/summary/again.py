@@ -18,6 +18,7 @@ from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.experiment.propose import SIZE
 from bayessim_mjx.diagnosis.findings import Findings
 from bayessim_mjx.diagnosis.fitting import windows
+from bayessim_mjx.diagnosis.fitting.delivered import Delivered
 from bayessim_mjx.diagnosis.fitting.discretisation import FACTORS, refined
 from bayessim_mjx.diagnosis.fitting.robot import contacts
 from bayessim_mjx.diagnosis.fitting.simulator import FAR, Simulator, physics_of
@@ -93,15 +94,15 @@ def _chains(setup: Setup, logs: Array, starts: Sequence[int], length: int) -> wi
     return _cut(setup, setup.physics, each)
 
 
-def _cut(setup: Setup, physics: Physics, starts: list[tuple[int, int]]) -> windows.Windows:
-    """Windows of the setup's length at these (log, row)."""
+def _cut(setup: Setup, physics: Physics, starts: list[tuple[int, int]], many: int = 1) -> windows.Windows:
+    """Windows of the setup's length, or of many of it, at these (log, row)."""
     cut = setup.fitter.simulator.windows
     return windows.cut(
         setup.logs,
         physics.mj_model,
         cut.dt,
         physics.substeps,
-        cut.steps,
+        cut.steps * many,
         limit=len(starts),
         starts=starts,
         centred=False,
@@ -119,9 +120,22 @@ def _simulated(found: Findings, chains: windows.Windows, stages: Sequence[str], 
     thetas, offsets = (np.concatenate(each) for each in zip(*drawn, strict=True))
     chain = np.repeat(np.arange(len(chains)).reshape(len(first), -1), len(thetas) // len(first), axis=0)
     raw = fitter.simulator.run_on(thetas, offsets, chains, chain)
-    raw[np.abs(raw) >= FAR] = np.nan
     raw = raw.reshape(len(first), -1, *raw.shape[1:])
+    if found.setup.delivered is not None:
+        raw[:, stages.index("nominal")] = _as_delivered(found, found.setup.delivered, first, chain.shape[1])
+    raw[np.abs(raw) >= FAR] = np.nan
     return np.asarray(raw[..., fitter.used] / fitter.sigma)
+
+
+def _as_delivered(found: Findings, delivered: Delivered, first: Sequence[int], many: int) -> Array:
+    """Errors `[L, H, 2 nv]` of the model as delivered on the logs of these windows, by the commands that are nearer."""
+    setup, fitter = found.setup, found.setup.fitter
+    cut = fitter.simulator.windows
+    starts = [(int(cut.log[w]), int(cut.start[w])) for w in first]
+    cuts, moved = [_cut(setup, setup.physics, starts, many)], setup.gate.timing.moved
+    cuts += [delivered.recorded(starts, cut, setup.logs, moved, many)] if moved else []
+    played = [delivered.played(own, found.predictions["nominal"].offsets[first]) for own in cuts]
+    return min(played, key=lambda errors: float(np.sum(fitter.whiten(errors[:, : cut.steps]) ** 2)))
 
 
 def _drawn(found: Findings, stages: Sequence[str], law: Array, w: int) -> tuple[Array, Array]:

@@ -15,12 +15,12 @@ import yaml
 from numpy.typing import NDArray
 
 from bayessim_mjx import atomic, urdf
-from bayessim_mjx.diagnosis.correction import Found, correction
+from bayessim_mjx.diagnosis.correction import Found, Stepping, correction, stepping_of
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Observer
 from bayessim_mjx.diagnosis.fitting import journal
 from bayessim_mjx.diagnosis.fitting.robot import Robot, Source, one_line
-from bayessim_mjx.diagnosis.phrases import notes
+from bayessim_mjx.diagnosis.phrases import notes, time_step
 from bayessim_mjx.diagnosis.phrases.advice import MODEL
 from bayessim_mjx.diagnosis.result import Diagnosis, load, plain
 from bayessim_mjx.diagnosis.selection.numbers import Progress
@@ -242,17 +242,18 @@ def write_outputs(diagnosis: Found, robot: Robot, folder: str | Path) -> list[st
     effects, calibrated = found.effects, ParameterSpace(found.calibrated)
     every = [*calibrated.parameters, *(p for e in effects for p in e.space().parameters)]
     identified = {p.name: (p.mean, p.sd) for p in every if p.mean is not None and p.sd is not None}
-    storage.write(folder / "effects.yaml", effects, identified, calibrated)
+    stepping = stepping_of(diagnosis)
+    _add_stepping(storage.write(folder / "effects.yaml", effects, identified, calibrated), stepping)
     for name in (MODEL, URDF):  # of an earlier diagnosis
         (folder / name).unlink(missing_ok=True)
     if robot.spec is None:
         return [f"{MODEL} is not written: a compiled model has no specification; give its MJCF or MjSpec"]
     source = robot.spec()
     spec, missing = native.write_model(source, calibrated, calibrated.nominal, effects)
-    spec = _friction_acting(_at_home(spec, source.modelfiledir))
+    spec, how = _stepping(_friction_acting(_at_home(spec, source.modelfiledir)), stepping)
     left_out = "".join(f"  {sentence}\n" for sentence in missing)
     note = f"<!-- Not in this model:\n{left_out.replace('--', '- -')}-->\n" if missing else ""
-    (folder / MODEL).write_text(note + spec.to_xml(), encoding="utf-8")
+    (folder / MODEL).write_text(how + note + spec.to_xml(), encoding="utf-8")
     try:
         model = mujoco.MjModel.from_xml_path(str(folder / MODEL))
     except ValueError as error:
@@ -265,6 +266,30 @@ def write_outputs(diagnosis: Found, robot: Robot, folder: str | Path) -> list[st
     lacks += [p.name for p in found.calibrated if p.attribute not in CALIBRATED_IN_URDF]
     has = "a URDF has friction and damping of joints and inertias of links"
     return [*said, *([f"{URDF} leaves out {', '.join(lacks)}: {has}"] if lacks else [])]
+
+
+def _add_stepping(file: Path, found: Stepping | None) -> None:
+    """Add to an effects.yaml the integrator and the time step that its numbers belong to."""
+    if found is not None:
+        step = {"simulated": {"integrator": found.integrator, "timestep": _rounded(found.timestep)}}
+        said = "".join(f"# {line}\n" for line in _written(found).split(". "))
+        file.write_text(file.read_text(encoding="utf-8") + said + yaml.safe_dump(step, sort_keys=False), "utf-8")
+
+
+def _stepping(spec: mujoco.MjSpec, found: Stepping | None) -> tuple[mujoco.MjSpec, str]:
+    """Return the specification with the integrator and the time step of the diagnosis, and a comment that says so."""
+    if found is None:
+        return spec, ""
+    spec.option.integrator, spec.option.timestep = mujoco.mjtIntegrator(found.number), _rounded(found.timestep)
+    return spec, f"<!-- {_written(found)} -->\n"
+
+
+def _written(found: Stepping) -> str:
+    return time_step.written(found.integrator, found.timestep, found.own, found.own_step)
+
+
+def _rounded(seconds: float) -> float:
+    return float(f"{seconds:.9g}")
 
 
 def _friction_acting(spec: mujoco.MjSpec) -> mujoco.MjSpec:
@@ -314,6 +339,5 @@ def header(
         "logs": len(recorded),
         "seconds": float(sum(log.duration for log in recorded)),
         "stated": dict(zip(("accuracy", "payload", "tolerance"), map(list, stated), strict=True)),
-        "model_timestep": float(robot.mj_model.opt.timestep),
         "date": time.strftime("%Y-%m-%d %H:%M"),
     }

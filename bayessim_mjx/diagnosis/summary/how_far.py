@@ -42,6 +42,8 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
     noises = {s: by_joint(p, cut.steps, allowed) / cut.sigma_q for s, p in predictions.items()}
     by_channel = {n: {s: float(v[i]) for s, v in noises.items()} for i, n in allowed.measured()}
     physical = {n: main["physical"][n] | own for n, own in _remains(predictions["with_effects"], allowed).items()}
+    step, own = setup.discretisation, found.selection.state.nominal
+    otherwise = float(np.sqrt(own.quadratic()[0].c.sum() / own.r.size))  # with its start states fitted
     return Gap(
         noise_floor=1.0,
         nominal=main["nominal"],
@@ -54,7 +56,7 @@ def measured(found: Findings, closed: dict[str, Any]) -> Gap:
         shares=main["shares"],
         beyond=[n for n, own in physical.items() if own["beyond"]],
         closed=closed,
-        integrator=setup.discretisation.to_dict() if setup.discretisation else {},
+        integrator=step.to_dict() | step.in_gap(main["nominal"], otherwise) if step else {},
         coasting=heldout.stages({"coasting": still.cost(cut.steps)}, cut.condition)["coasting"],
         in_sample=cut.blocks,
     )

@@ -76,7 +76,7 @@ def verdict_of(found: Findings, far: Gap) -> Verdict:
     # noise of the sensors excuses a remainder, and not that the effects close little of what is above it
     above = of_rms(far.calibrated, far.with_effects, math.sqrt(max(force.noise, 1.0)))
     little = bool(found.model.effects) and above.left > above.closed
-    name = "unexplained" if missing or any(off) or little else _explained(found, noise)
+    name = "unexplained" if missing or any(off) or little else _explained(found, far, noise)
     return Verdict(name, force.motion / gap if missing else 0.0, chance, noise, off, builds_up(found, far))
 
 
@@ -134,13 +134,22 @@ def builds_up(found: Findings, far: Gap) -> float:
     return over.over_likely if over.over_likely > CLEAR and far.with_effects <= FLOOR else 0.0
 
 
-def _explained(found: Findings, noise: Origin | None) -> str:
-    """Return the verdict where no relevant force is missing."""
+def _explained(found: Findings, far: Gap, noise: Origin | None) -> str:
+    """Return the verdict where no relevant force is missing.
+
+    No gap is there too where the delivered simulator is at the noise, or where its time step makes most of the gap and
+    no parameter is clearly off.
+    """
     state, model = found.selection.state, found.model
     if model.effects:
         return "ambiguous" if found.selection.ambiguous else "effects"
     if noise is not None or found.selection.force.noise > FLOOR**2:
         return "noise"
+    if "share" in far.integrator:
+        own, neutral = found.selection.estimated, np.array([c.neutral for c in model.fit.coordinates])
+        off = np.abs(own.mean - neutral) > CLEAR * np.sqrt(np.diag(own.covariance))
+        if of_one(far.nominal**2).at_noise or (far.integrator["share"] > 0.5 and not off.any()):
+            return "no_gap"
     calibrated = state.gap(state.base)
     q, _ = state.nominal.quadratic()
     nominal = of_one(float(q.c.sum()), calibrated.noise)

@@ -14,11 +14,13 @@ import pytest
 from bayessim_mjx.diagnosis import setup
 from bayessim_mjx.diagnosis.fitting import discretisation, integrator_choice, robot
 from bayessim_mjx.diagnosis.fitting.cutting import windows_of
+from bayessim_mjx.diagnosis.fitting.delivered import Delivered
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
 from bayessim_mjx.diagnosis.setup import _measured
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
+from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.physics import native
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole diagnoses and fits
@@ -147,7 +149,7 @@ def test_without_noise_the_step_itself_is_the_floor(finer):
     assert found.simulated.all()
     assert (left[min(found.factor, 4)] / found.floor[:2]).max() < 1.2
     assert (left[1] / found.sigma[:2]).max() > 10  # a huge gap, were the floor the sensors' alone
-    assert "no noise" in found.warnings()[0]
+    assert "show no noise" in found.warnings()[0]
 
 
 def test_noise_is_seen_whatever_the_motion():
@@ -214,15 +216,15 @@ def test_what_is_left_beyond_the_tolerance_is_told():
     assert not discretisation.Discretisation(*given).beyond()
 
 
-def chosen(recorded, limit, *left):
-    """How the arm is simulated, and the integrators that were tried."""
+def chosen(recorded, limit, *left, xml=ARM):
+    """How a robot is simulated, and the integrators that were tried."""
     tried = []
 
     def measured_by(own, **rest):
         tried.append(int(own.mj_model.opt.integrator))
-        return _measured(own, recorded, None, False, np.full(2, limit), **rest)
+        return _measured(own, recorded, None, False, np.full(own.mj_model.nv, limit), **rest)
 
-    return integrator_choice.choose(the(ARM), PERIOD, recorded, measured_by, *left), tried
+    return integrator_choice.choose(the(xml), PERIOD, recorded, measured_by, *left), tried
 
 
 @pytest.mark.parametrize("noise", [0.05, NOISE])
@@ -232,6 +234,71 @@ def test_where_nothing_touches_the_integrator_is_runge_and_kuttas(noise):
     assert tried == [mujoco.mjtIntegrator.mjINT_RK4] == [found.robot.mj_model.opt.integrator]
     assert not found.said()
     assert found.worth.believed > 0.9
+
+
+def test_the_error_is_that_of_the_delivered_integrator_where_the_diagnosis_has_another():
+    """A pushed mass: Euler is ahead by a h t / 2, and RK4, by which it is simulated, is exact."""
+    found, _ = chosen(logs(MASS, push), 1.0, xml=MASS)
+    assert (found.worth.integrator, found.worth.delivered.integrator) == ("RK4", "Euler")
+    since = PERIOD * np.arange(1, 51)
+    assert found.worth.own[0] == pytest.approx(3.0 / 2.0 * STEP / 2 * np.sqrt(np.mean(since**2)), rel=0.002)
+    assert (found.worth.left[:1] / found.worth.sigma[:1]).max() < 0.01
+    (text,) = found.warnings()
+    assert "time step of 5 ms (Euler) costs" in text and "The diagnosis simulates by RK4 at 5 ms, which leaves" in text
+
+
+SERVO = ARM.replace("<motor", '<position kp="9" kv=".4"')
+
+
+def rested(xml, integrator, timestep, command):
+    """Angles of a servoed arm that begins at rest, in plain MuJoCo."""
+    spec = mujoco.MjSpec.from_string(xml)
+    spec.option.integrator, spec.option.timestep = integrator, timestep
+    model = spec.compile()
+    data, angles = mujoco.MjData(model), []
+    for ctrl in command:
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(model, data, round(PERIOD / timestep))
+        angles.append(data.qpos.copy())
+    return np.array(angles)
+
+
+def test_the_error_of_a_servos_step_is_that_which_plain_mujoco_has():
+    """From rest, so that the start is known: implicitfast at 5 ms beside RK4 at .1 ms."""
+    recorded = logs(SERVO, lambda i, t, q, v: 0.5 * np.sin(np.array([3.0, 4.0]) * t + i))
+    model = the(SERVO).mj_model
+    cut = windows_of(the(SERVO).physics(PERIOD), recorded, None, False)(1)
+    around, at = cut.batch.around, cut.batch.around.start
+    offsets = -np.concatenate([np.asarray(around.qpos)[:, at], np.asarray(around.qvel)[:, at]], 1)
+    found = Delivered(model, PERIOD).step_error(cut, offsets, 4)
+    for w in (0, len(cut) - 1):
+        rows = cut.logs[cut.log[w]].ctrl[cut.start[w] : cut.start[w] + cut.steps]
+        coarse = rested(SERVO, model.opt.integrator, STEP, rows)
+        fine = rested(SERVO, mujoco.mjtIntegrator.mjINT_RK4, 1e-4, rows)
+        np.testing.assert_allclose(found[w, :, :2], fine - coarse, atol=0.002 * np.abs(fine - coarse).max())
+
+
+@pytest.mark.parametrize("change", ["law", "off"])
+def test_commands_through_a_loop_or_a_drive_that_is_off_are_not_plain_mujocos(change):
+    (log,) = logs(SERVO, lambda i, t, q, v: np.full(2, 0.1), count=1, rows=20)
+    metadata = {"controller": {"law": "position", "kp": 1.0}} if change == "law" else {}
+    streams = {"enabled:a": np.zeros(20)} if change == "off" else {}
+    given = Delivered(the(ARM).mj_model, PERIOD)
+    named = dataclasses.replace(log, metadata=metadata, streams=streams)
+    space = the(ARM).space
+    assert given.plays([log], space) and not given.plays([log, named], space)
+
+
+@pytest.mark.parametrize(
+    ("operation", "own", "other"), [("scaling", 1.0, 1.2), ("additive", 0.0, 0.1), ("absolute", 0.03, 0.06)]
+)
+def test_parameters_whose_nominal_values_are_not_the_models_are_not_plain_mujocos(operation, own, other):
+    given = Delivered(the(ARM).mj_model, PERIOD)
+    for nominal in (own, other):
+        known = Parameter(
+            "d", nominal, 0.0, 2.0, operation=operation, attribute="damping", target="elbow", kind="joint"
+        )
+        assert given.plays([], ParameterSpace([known])) == (nominal == own)
 
 
 def test_where_time_is_limited_the_integrator_stays_unless_a_search_by_the_better_one_fits():

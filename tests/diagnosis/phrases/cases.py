@@ -5,9 +5,12 @@ Each exists for sentences that no other has. Numbers are chosen so that shares c
 
 import dataclasses
 
+import mujoco
 import numpy as np
 
-from bayessim_mjx.diagnosis.phrases import advice, notes, parameters, verdict
+from bayessim_mjx.diagnosis.fitting.delivered import Delivered
+from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation
+from bayessim_mjx.diagnosis.phrases import advice, notes, parameters, time_step, verdict
 from bayessim_mjx.diagnosis.request import Tolerance
 from bayessim_mjx.diagnosis.result import Diagnosis, Estimate, FoundEffect, Gap
 from bayessim_mjx.diagnosis.summary.estimates import answers
@@ -27,6 +30,9 @@ RANKED = [
 ]
 FURTHER = [RANKED[0] | {"effects": ["coulomb_friction@hinge", "gain@torque"], "gap_closed": 0.9815},
            RANKED[1] | {"gap_closed": 0.98}, RANKED[2]]  # fmt: skip
+FAST = '<mujoco><option integrator="implicitfast"/></mujoco>'
+STEP = {"timestep": 0.005, "substep": 0.005, "integrator": "RK4", "delivered": "implicitfast"}
+COARSE = dataclasses.replace(NO_EFFECTS, nominal=6.1, calibrated=0.93, with_effects=0.93)
 BASIS = {"window": 0.5, "remains": 0.0, "above_noise": True}
 
 
@@ -81,6 +87,21 @@ def gap(far=LEVEL, rows=None, **changes):
     return dataclasses.replace(far, physical=physical, beyond=beyond, **changes)
 
 
+def coarse():
+    """Results on a model whose time step makes much of the gap."""
+    return {
+        "no gap but the time step": made(
+            "no_gap", far=gap(COARSE, integrator=STEP | {"otherwise": 1.02, "share": 0.99}), above_noise=False
+        ),
+        "no gap but the time step, and parameters that are hardly off": made(
+            "no_gap", far=gap(COARSE, integrator=STEP | {"otherwise": 1.53, "share": 0.96}), above_noise=False
+        ),
+        "parameters and the time step": made(
+            "parameters", far=gap(COARSE, integrator=STEP | {"otherwise": 4.0, "share": 0.59}), above_noise=False
+        ),
+    }
+
+
 def every():
     """{what it shows: result}."""
     left = {"hinge": ROW | {"with_effects": 0.03, "largest": 0.09, "beyond": True}, "elbow": ROW}
@@ -104,6 +125,7 @@ def every():
     return {
         "no gap": made("no_gap", far=gap(NO_EFFECTS, **quiet), above_noise=False),
         "a gap too small to identify": made("no_gap", far=gap(NO_EFFECTS, **loud), above_noise=False),
+        **coarse(),
         "parameters": made("parameters", far=gap(NO_EFFECTS, calibrated=1.1, with_effects=1.1), above_noise=False),
         "parameters, or an effect": made(
             "parameters", far=gap(NO_EFFECTS, calibrated=1.1, with_effects=1.1), above_noise=False,
@@ -141,6 +163,19 @@ def every():
     }  # fmt: skip
 
 
+def steps():
+    """Notes on the delivered time step: with another integrator, of logs with noise, and of those without."""
+    one, other = np.full(2, 1e-3), Delivered(mujoco.MjModel.from_xml_string(FAST), 0.02)
+    given = dict(timestep=0.005, order=1.0, own=7 * one, settled=6 * one, sigma=one, channels=("hinge",))
+    left, noisy, quiet = np.array([2e-4, 0.0]), np.zeros(1, bool), np.ones(1, bool)
+    made = [
+        dict(factor=1, left=left, floor=one, simulated=noisy, integrator="RK4", delivered=other),
+        dict(factor=2, left=one, floor=2 * one, simulated=noisy),
+        dict(factor=1, left=one, floor=7 * one, simulated=quiet),
+    ]
+    return [text for more in made for text in Discretisation(**given, **more).warnings()]
+
+
 def warnings():
     """Notes that stand among the warnings."""
     one = np.ones(1)
@@ -161,6 +196,8 @@ def warnings():
         *notes.whole_logs(names, names[:6], names[6:7], 2.4, away, 7, 3),
         *notes.whole_logs(names, names, [], 0.0, {}, 0, 0),
         *notes.horizon_warning(Gap(1.0, 4.0, 3.0, 1.1, 1.0, horizons=rows)),
+        *steps(),
+        time_step.written("RK4", 0.005, "implicitfast", 0.005),
         parameters.less_accurate({"mass": (0.2, 0.1, 0.4)}),
     ]
 

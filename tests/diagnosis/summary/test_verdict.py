@@ -18,8 +18,13 @@ def force(motion: float, nats: float = 100.0, spread: float = 0.1, noise: float 
     return ForceLeft(one, 0.9 * one, 1.1 * one, nats, motion, spread * motion, motion * one, noise)
 
 
-def verdict_on(left: ForceLeft, calibrated=3.0, effects=("x",), coasting=None, nominal=9.0) -> verdict.Verdict:
-    """The verdict on an answer that leaves a force; calibrated, nominal: rms, in noise standard deviations."""
+def verdict_on(
+    left: ForceLeft, calibrated=3.0, effects=("x",), coasting=None, nominal=9.0, step=None, delivered=9.0, off=0.0
+) -> verdict.Verdict:
+    """The verdict on an answer that leaves a force; calibrated, nominal, delivered: rms, in noise standard deviations.
+
+    step: share of the gap that another integrator closes; off: sd by which the only parameter is off.
+    """
 
     class State:
         base = None
@@ -31,12 +36,19 @@ def verdict_on(left: ForceLeft, calibrated=3.0, effects=("x",), coasting=None, n
 
     rms = nominal
     fit = SimpleNamespace(coordinates=(), values=())
+    if step is not None:
+        known = SimpleNamespace(neutral=1.0, stated=False, precision=1.0, kind="", name="mass")
+        fit = SimpleNamespace(coordinates=(known,), values=(1.0 + 0.1 * off,))
+    own = SimpleNamespace(mean=np.array(fit.values), covariance=np.array([[0.01]]))
     found = SimpleNamespace(
         model=SimpleNamespace(effects=tuple(SimpleNamespace(coordinates=()) for _ in effects), fit=fit),
-        selection=SimpleNamespace(state=State(), ambiguous=False, force=left),
+        selection=SimpleNamespace(state=State(), ambiguous=False, force=left, estimated=own),
         part=lambda kind: None,
     )
-    far = SimpleNamespace(coasting=coasting, calibrated=calibrated, with_effects=1.0)
+    known_step = {} if step is None else {"share": step}
+    far = SimpleNamespace(
+        coasting=coasting, calibrated=calibrated, with_effects=1.0, nominal=delivered, integrator=known_step
+    )
     return verdict.verdict_of(found, far)
 
 
@@ -98,3 +110,17 @@ def test_noise_that_lasts_is_no_force(sensors):
 )
 def test_names_where_no_effect_is_named(left, nominal, name):
     assert verdict_on(left, calibrated=1.0, effects=(), nominal=nominal).name == name
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ({"step": 0.9, "off": 1.0}, "no_gap"),  # the time step makes most of the gap, and no parameter is off
+        ({"step": 0.9, "off": -3.0}, "parameters"),
+        ({"step": 0.2, "off": 1.0}, "parameters"),
+        ({"step": 0.0, "off": 3.0, "delivered": 1.0}, "no_gap"),  # the logs are those of the delivered time step
+        ({}, "parameters"),
+    ],
+)
+def test_a_gap_of_the_time_step_is_none_of_the_parameters(given, name):
+    assert verdict_on(force(0.05), calibrated=1.0, effects=(), nominal=1.4, **given).name == name
