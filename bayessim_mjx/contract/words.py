@@ -8,15 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.contract import axes
+from bayessim_mjx.contract import axes, remainder
 from bayessim_mjx.contract.evidence import Finding, Result
 from bayessim_mjx.contract.manifest import Entry
-from bayessim_mjx.contract.relate import Relation
+from bayessim_mjx.contract.relate import CLEAR, Relation
 from bayessim_mjx.quantities import compact, listed, percent
 
 Array = NDArray[np.float64]
 SAME = 0.02  # by which two numbers of one finding may differ, relatively; a rule of thumb
-CLEAR = 5.0  # times its noise: motion that has to show in what follows from it; a rule of thumb
 
 
 def judge(
@@ -51,7 +50,7 @@ def judge(
         else:
             found = []
         faults += [(entry.name, fault) for fault in found if fault.kind not in quiet]
-    return _together(part, _poses(faults, lines))
+    return together(part, _poses(faults, lines))
 
 
 def _poses(
@@ -80,7 +79,7 @@ def _still(entry: Entry, own: Array, base: Array, result: Result) -> list[axes.F
     moves = float(np.std(expected)) > limit
     if np.ptp(own) <= 1e-9 * max(1.0, abs(float(own[0]))) and moves:
         return [axes.Fault("frozen", float(own[0]), "")]
-    if moves and _clear(own) and _clear(expected):
+    if moves and _clear(expected) and (_clear(own) or remainder.contradicts(own, expected)):
         return [axes.Fault("unrelated", "", "")]
     result.untold[entry.name] = "still" if not moves else "noise"
     if entry.kind == "action":
@@ -107,7 +106,7 @@ def _clear(values: Array) -> bool:
     return float(np.std(values)) > CLEAR * noise
 
 
-def _together(part: str, faults: Sequence[tuple[str, axes.Fault]]) -> list[Finding]:
+def together(part: str, faults: Sequence[tuple[str, axes.Fault]]) -> list[Finding]:
     """One finding for all entries with the same fault."""
     found: list[Finding] = []
     for name, fault in faults:
@@ -142,6 +141,7 @@ SENTENCES = {
     "command_fed_back": "previous commands are fed back in place of actions",
     "other_source": "shows {found}",
     "unrelated": "follows from no logged source",
+    "beyond": "{found} (rms) off what its source, timing and noise explain",
     "frozen": "constant at {found} while its source moves",
     "sign": "sign is flipped",
     "unit": "in {found} in place of {expected}",
