@@ -47,11 +47,11 @@ def golden(evidence: Evidence, result: Result, pairs: dict[str, Array] | None) -
             result.compared.setdefault("golden", []).append(part)
 
 
-def clock(evidence: Evidence, result: Result, fed_back: bool) -> None:
+def clock(evidence: Evidence, result: Result, complete: bool | None) -> None:
     """Compare the rate of the policy's steps with the control period.
 
     Args:
-        fed_back: whether previous actions in the observations show that no step is missing in the log.
+        complete: whether the log has every step; None: nothing shows it.
     """
     dt = evidence.manifest.dt
     steps = np.concatenate([np.diff(run.time) for run in evidence.runs])
@@ -61,8 +61,9 @@ def clock(evidence: Evidence, result: Result, fed_back: bool) -> None:
     # steps that alternate between two periods have a mean that tells more than their median
     if abs(ratio - 1) <= RATE:
         result.compared.setdefault("clock", []).append("rate")
-    elif ratio > 1.5 and abs(ratio - round(ratio)) <= RATE * round(ratio) and not fed_back:
-        result.notes.append(f"every_nth {round(ratio)} {1 / period:.4g} {1 / dt:.4g}")
+    elif ratio > 1.5 and abs(ratio - round(ratio)) <= RATE * round(ratio) and not complete:
+        kind = "slower_or_nth" if complete is None else "every_nth"
+        result.notes.append(f"{kind} {round(ratio)} {1 / period:.4g} {1 / dt:.4g}")
     else:
         result.findings.append(Finding("clock", "rate", (), 1 / period, 1 / dt))
     if late > GAPS:

@@ -113,7 +113,8 @@ def named(evidence: Evidence, entry: Entry, seen: Array, left: float) -> tuple[F
     best = min(shares, key=lambda key: shares[key])
     if shares[best] >= EXPLAINS * left:
         return None
-    return Fault(*best, {"unit": "rad", "offset": 0.0}.get(best[0], entry.name)), shares[best]
+    right: dict[str, float | str] = {"unit": "rad", "offset": 0.0}
+    return Fault(*best, right.get(best[0], entry.name)), shares[best]
 
 
 def _shift(seen: Array, angle: Array, wave: Callable[[Array], Array]) -> float:
