@@ -72,13 +72,16 @@ def contradicts(seen: Array, expected: Array) -> bool:
         seen: [N]. expected: [N] of a source that has no noise; with noise in it the slope is lower.
     """
     x, y = expected - expected.mean(), seen - seen.mean()
-    if np.std(x) < NOISE * np.std(np.diff(x)):  # a part of a step is enough to hide the relation
-        return False
     slope = float(x @ y / (x @ x))
     rest = y - slope * x
     alike = max(0.0, _following(x) * _following(rest))
     count = len(x) * (1 - alike) / (1 + alike)  # of rows that do not repeat each other (Bartlett 1946, eq. 1)
     return abs(slope - 1.0) > CLEAR * float(np.std(rest) / (np.std(x) * np.sqrt(max(count, 1.0)))) + NEAR
+
+
+def slow(values: Array) -> bool:
+    """Whether a channel moves little in one step: else a part of a step is enough to hide a relation with it."""
+    return float(np.std(values)) >= NOISE * float(np.std(np.diff(values)))
 
 
 def _following(values: Array) -> float:

@@ -79,7 +79,12 @@ def _still(entry: Entry, own: Array, base: Array, result: Result) -> list[axes.F
     moves = float(np.std(expected)) > limit
     if np.ptp(own) <= 1e-9 * max(1.0, abs(float(own[0]))) and moves:
         return [axes.Fault("frozen", float(own[0]), "")]
-    if moves and _clear(expected) and (_clear(own) or remainder.contradicts(own, expected)):
+    if (
+        moves
+        and _clear(expected)
+        and remainder.slow(expected)
+        and (_clear(own) or remainder.contradicts(own, expected))
+    ):
         return [axes.Fault("unrelated", "", "")]
     result.untold[entry.name] = "still" if not moves else "noise"
     if entry.kind == "action":
