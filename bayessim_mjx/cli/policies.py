@@ -53,9 +53,11 @@ def origin(path: Path, run: "Run | None", newest_of: str = "") -> str:
         return ""
     score = next((c["evaluation"] for c in run.checkpoints if run.path / c["path"] == path), None)
     parts = [f"run {run.path.name}", *([] if score is None else [f"return {compact(score)}"])]
-    count = len(find_runs(newest_of, run.manifest["task"])) if newest_of else 1
-    several = f"newest of {count} runs; --checkpoint RUN for another"
-    return ", ".join([*parts, *([several] if count > 1 else [])])
+    runs = find_runs(newest_of, run.manifest["task"]) if newest_of else []
+    if len(runs) > 1:
+        newest = "newest" if runs[-1].path == run.path else "newest that trained,"
+        parts.append(f"{newest} of {len(runs)} runs; --checkpoint RUN for another")
+    return ", ".join(parts)
 
 
 def _without_best(run: "Run", logdir: str, task: str) -> str:

@@ -40,7 +40,9 @@ def test_the_best_is_that_of_the_newest_run_that_trained(tmp_path: Path) -> None
     path, run_ = cli.find_checkpoint("best", "Ant", str(tmp_path))
     assert run_ is not None and run_.path == made[1].path
     of_all = cli.origin(path, run_, str(tmp_path))
-    assert of_all == f"run {made[1].path.name}, return 7.25, newest of 3 runs; --checkpoint RUN for another"
+    assert (
+        of_all == f"run {made[1].path.name}, return 7.25, newest that trained, of 3 runs; --checkpoint RUN for another"
+    )
     assert cli.origin(path, run_) == f"run {made[1].path.name}, return 7.25"
     assert cli.find_checkpoint("latest", "Ant", str(tmp_path))[0].parents[1] == made[2].path
 
