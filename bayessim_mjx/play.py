@@ -133,17 +133,18 @@ def _video(config: Config, env: Any, policy: Any, physics: tuple[str, Any], key:
     return f"video: {path}" if made is not None else "no video could be made here"
 
 
-def _export(env: Any, policy: Any, checkpoint: Path, run: Any, target: str) -> str:
-    """Write the ONNX file; what to say of it."""
+def _export(env: Any, policy: Any, checkpoint: Path, run: Any, target: str, whose: str) -> str:
+    """Write the ONNX file; what to say of it. `whose`: of which run and return the policy is."""
     from bayessim_mjx.rl import export
 
     folder = (run.path if run is not None else checkpoint.parent) / "exported"
     path = Path(target) if target else folder / f"{checkpoint.name}.onnx"
-    error = export.write(path, policy, env, {"checkpoint": checkpoint.name})
+    score = {} if not whose else {"trained": whose}
+    error = export.write(path, policy, env, {"checkpoint": checkpoint.name, **score})
     checked = "not compared (onnxruntime is not installed)"
     if error is not None:
         checked = f"its actions differ by {error:.1e} at most from the policy's"
-    return f"exported {path}: {checked}"
+    return f"exported {path}: {checked}{f'; {whose}' if whose else ''}"
 
 
 def _hub(args: argparse.Namespace, env: Any, policy: Any, config: Config, run: Any, returns: dict[str, Any]) -> str:
@@ -216,6 +217,11 @@ def _policy(args: argparse.Namespace, config: Config, path: Path, env: Any) -> A
     return policy
 
 
+def _searched(args: argparse.Namespace, config: Config) -> str:
+    """Return the folder in which latest or best was looked for; "" where a path was given."""
+    return config.logdir if args.checkpoint in (None, "best", "latest") else ""
+
+
 def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count: int, console: Any) -> int:
     """Show the table of returns, and the video."""
     setup_jax(config)
@@ -229,8 +235,9 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
     config = dataclasses.replace(config, randomization=freeze({**config.randomization, "randomize": True}))
     env = plain = _acted_in(config, run)
     policy, key = _policy(args, config, path, env), jax.random.PRNGKey(config.seed)
+    whose = "" if args.use_pretrained_checkpoint else cli.origin(path, run, _searched(args, trained))
     if args.export is not None:
-        console.say(_export(env, policy, path, run, args.export))
+        console.say(_export(env, policy, path, run, args.export, whose))
         return 0
     kinds = _physics(config, env, None if args.use_pretrained_checkpoint else path, key, count)
     if trained.randomization.get("randomize") is False and getattr(env, "nuisance", None):
@@ -238,8 +245,9 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
         kinds["nominal"] = lambda: _nominal(plain, count)
     if args.physics and args.physics not in kinds:
         raise UserError(f"--physics {args.physics}: this checkpoint and task have {', '.join(kinds)}")
-    whose = "the policy that comes with the package" if args.use_pretrained_checkpoint else f"checkpoint {path}"
-    console.say(f"{config.task}, {count} episodes each, {whose}")
+    shown = f"checkpoint {path}{f' ({whose})' if whose else ''}"
+    shown = "the policy that comes with the package" if args.use_pretrained_checkpoint else shown
+    console.say(f"{config.task}, {count} episodes each, {shown}")
     chosen, rows = {name: kinds[name]() for name in kinds if args.physics in (None, name)}, []
     returns = {}
     for name, thetas in chosen.items():
@@ -250,7 +258,8 @@ def _show(args: argparse.Namespace, config: Config, path: Path, run: Any, count:
         rows.append((name, r, length))
     console.grid(HEADER, returns_table(rows))
     if args.hub:
-        console.say(_hub(args, env, policy, config, run, returns))
+        said = _hub(args, env, policy, config, run, returns)
+        console.say(f"{said}{f'; {whose}' if whose else ''}")
     if config.monitor.video:
         name = next(n for n in ("real", "posterior", "prior", "nominal") if n in chosen)
         console.say(f"filming an episode on {KINDS[name]} ...")

@@ -71,6 +71,11 @@ def compact(value: Any, digits: int = 4) -> str:
     return f"{x:.{digits}g}"
 
 
+def ordinal(n: int) -> str:
+    """`1st`, `2nd`, `3rd`, `4th`, `11th`."""
+    return f"{n}{'th' if n % 100 in (11, 12, 13) else {1: 'st', 2: 'nd', 3: 'rd'}.get(n % 10, 'th')}"
+
+
 def percent(share: Any, sign: bool = False) -> str:
     """Write a share in per cent: whole from 10 % on, two digits below; 99.5 to 99.9 % with a decimal, as not all."""
     if not finite(share := float(share) if _is_float(share) else share):

@@ -230,8 +230,12 @@ def _model(path: str | None, policy: Policy) -> Any:
     if path is not None:
         return mujoco.MjModel.from_xml_path(path)
     from bayessim_mjx import registry
+    from bayessim_mjx.errors import UserError
 
-    return registry.make(policy.facts["task"]).mj_model
+    try:
+        return registry.make(policy.facts["task"]).mj_model
+    except UserError as error:  # a task of your own
+        raise SystemExit(f"{error}; or give --model FILE, the MJCF file of the stand-in") from None
 
 
 if __name__ == "__main__":

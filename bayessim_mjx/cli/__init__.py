@@ -9,6 +9,7 @@ from bayessim_mjx.cli.policies import (
     find_checkpoint,
     load_policy,
     of_another_task,
+    origin,
     physics_settings,
     pin_policy,
     privileged,
@@ -20,7 +21,7 @@ from bayessim_mjx.cli.status import Stop, first_writes, graceful, running
 __all__ = [
     "COMMANDS", "DEBUG_VARIABLE", "SCRIPT", "Parser", "PlainParser", "Stop", "command", "config_of", "find_checkpoint",
     "first_writes", "graceful", "integer", "list_tasks", "load_policy", "of_another_task", "of_urdf", "one_robot",
-    "open_run", "physics_settings", "pin_policy", "positive", "privileged", "prog_of", "prolonged_config",
+    "open_run", "origin", "physics_settings", "pin_policy", "positive", "privileged", "prog_of", "prolonged_config",
     "resumed_config", "run_to_resume", "running", "say_changes", "task", "task_name", "urdf_words", "warm_start",
     "whole", "writable",
 ]  # fmt: skip

@@ -5,6 +5,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from bayessim_mjx.errors import UserError, out_of_memory, refused
 
@@ -14,20 +15,57 @@ OPENGL = "MUJOCO_GL"  # MuJoCo loads the OpenGL library of this name when it is 
 LIBRARIES = "egl (Debian: libegl1), osmesa (libosmesa6), glfw (libglfw3, with a screen), or disable (no video)"
 
 
+CLOSED = 141  # exit code of what writes to a closed pipe, as shells give it: 128 + SIGPIPE
+
+
+class Piped:
+    """A stream whose reader may go, as in `... | head`: what follows is dropped, and the command ends its work."""
+
+    def __init__(self, stream: Any) -> None:
+        self.stream, self.left = stream, False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+    def write(self, text: str) -> int:
+        return self._through(lambda: self.stream.write(text), len(text))
+
+    def flush(self) -> None:
+        self._through(self.stream.flush, None)
+
+    def _through(self, do: Callable[[], Any], instead: Any) -> Any:
+        try:
+            return do()
+        except BrokenPipeError:
+            self.left = True
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
+            return instead
+
+
 def command(run: Callable[[Sequence[str] | None], int]) -> Callable[..., int]:
     """Return a `main(argv=None)` that returns an exit code.
 
-    0; 2 and one line on stderr for what the user can mend; 1 and a traceback for a bug; 130 after Ctrl-C.
+    0; 2 and one line on stderr for what the user can mend; 1 and a traceback for a bug; 130 after Ctrl-C; 141 in place
+    of 0 where nobody read on.
     """
 
     def main(argv: Sequence[str] | None = None) -> int:
+        before = sys.stdout, sys.stderr
+        piped = Piped(sys.stdout), Piped(sys.stderr)
+        sys.stdout, sys.stderr = piped
+        try:
+            code = ended(argv)
+            for stream in piped:
+                stream.flush()
+            return code or (CLOSED if any(stream.left for stream in piped) else 0)
+        finally:
+            sys.stdout, sys.stderr = before
+
+    def ended(argv: Sequence[str] | None) -> int:
         try:
             return run(argv)
         except KeyboardInterrupt:
             return 130
-        except BrokenPipeError:  # `... | head`: nobody reads on
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 1
         except SystemExit as end:  # --help
             if end.code in (None, 0):
                 return 0

@@ -53,7 +53,7 @@ HEADINGS = {
 SAID = {  # what a flag means in one command, where that differs
     ("main", "--max_iterations"): "PPO iterations of each round",
     ("train", "--max_iterations"): "PPO iterations in all",
-    ("play", "--checkpoint"): "policy to play (default: best)",
+    ("play", "--checkpoint"): "policy to play; best: the highest return of the newest run that trained (default: best)",
     ("gap-loop", "--checkpoint"): "policies to evaluate in place of training new ones on the simulator as it was",
     ("train", "--resume"): "continue an interrupted run; with --max_iterations also a finished one",
 }

@@ -13,13 +13,16 @@ if TYPE_CHECKING:
 
 
 def find_checkpoint(which: str, task: str | None, logdir: str) -> tuple[Path, "Run | None"]:
-    """(checkpoint folder, its run) for "latest", "best" (of the task's newest run) or a run's or checkpoint's path."""
+    """(checkpoint folder, its run) for "latest", "best" (of the task's newest run) or a run's or checkpoint's path.
+
+    For "best" it is the newest run that trained: a run of 0 iterations has a policy that nobody looks for.
+    """
     from bayessim_mjx.runs import MANIFEST, Run, checkpoints, latest_run
 
     if which in ("latest", "best"):
         if not task:
             raise UserError(f"--checkpoint {which}: give --task NAME, or the path of a run")
-        run = latest_run(logdir, task)
+        run = latest_run(logdir, task, trained=which == "best")
         if which == "best" and run.manifest["best"] is None:
             raise UserError(_without_best(run, logdir, task))
         return run.checkpoint(which), run
@@ -35,6 +38,26 @@ def find_checkpoint(which: str, task: str | None, logdir: str) -> tuple[Path, "R
     checkpoints.read_index(path)
     parents = path.absolute().parents
     return path, Run.open(parents[1]) if (parents[1] / MANIFEST).is_file() else None
+
+
+def origin(path: Path, run: "Run | None", newest_of: str = "") -> str:
+    """Say of which run a checkpoint is, and its return there: `run 2026-01-01_10-00-00, return 98.5`; "" without a run.
+
+    Args:
+        newest_of: what was searched, for "latest" and "best": the folder of all runs; "" for a path.
+    """
+    from bayessim_mjx.quantities import compact
+    from bayessim_mjx.runs import find_runs
+
+    if run is None:
+        return ""
+    score = next((c["evaluation"] for c in run.checkpoints if run.path / c["path"] == path), None)
+    parts = [f"run {run.path.name}", *([] if score is None else [f"return {compact(score)}"])]
+    runs = find_runs(newest_of, run.manifest["task"]) if newest_of else []
+    if len(runs) > 1:
+        newest = "newest" if runs[-1].path == run.path else "newest that trained,"
+        parts.append(f"{newest} of {len(runs)} runs; --checkpoint RUN for another")
+    return ", ".join(parts)
 
 
 def _without_best(run: "Run", logdir: str, task: str) -> str:

@@ -411,6 +411,10 @@ class RNDConfig(Section):
         for name in ("predictor_hidden_dims", "target_hidden_dims"):
             if 0 in getattr(self, name):
                 raise UserError(f"{self.SECTION}.{name} = {list(getattr(self, name))}: widths are 1 or more, or -1")
+        if not self.weight and not (self.weight_schedule and self.weight_schedule.final_value):
+            raise UserError(
+                f"{self.SECTION}.weight = 0: novelty adds no reward; give a weight above 0, or {self.SECTION}=null"
+            )
 
 
 @dataclass(frozen=True)
@@ -429,6 +433,13 @@ class SymmetryConfig(Section):
     use_data_augmentation: bool = setting(False, "train on the mirrored samples too")
     use_mirror_loss: bool = setting(False, "add the mirror loss, the squared difference of a(M o) and M a(o)")
     mirror_loss_coeff: float = setting(0.0, "weight of the mirror loss", low=0)
+
+    def check(self) -> None:
+        if self.use_mirror_loss and not self.mirror_loss_coeff:
+            raise UserError(
+                f"{self.SECTION}.use_mirror_loss = True: {self.SECTION}.mirror_loss_coeff = 0 adds no loss; give a "
+                "coefficient above 0, as 1"
+            )
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,12 @@ from bayessim_mjx.contract.axes import NEAR
 from bayessim_mjx.contract.axes import findings as of_order
 from bayessim_mjx.contract.evidence import Evidence, Finding, Result, shifted
 from bayessim_mjx.contract.manifest import Entry
-from bayessim_mjx.contract.relate import Relation, relate
+from bayessim_mjx.contract.relate import EXPLAINS, Relation, relate
 from bayessim_mjx.contract.words import judge
 
 Array = NDArray[np.float64]
 DIGITS = 1e-3  # of an action: three digits of a log; a rule of thumb
 EQUAL = 2e-3  # share of variance: texts of four digits and float32 leave less; a rule of thumb
-CLOSE = 0.1  # factor by which another input has to explain the actions better; a rule of thumb
 RATE = 0.05  # relative distance of a rate that counts: clocks of small computers are 1 % off; a rule of thumb
 GAP, GAPS = 1.5, 0.05  # periods of a late step, share of late steps that counts; rules of thumb
 SATURATED = 0.02  # share of rows at one limit that makes it a limit; a rule of thumb
@@ -48,11 +47,11 @@ def golden(evidence: Evidence, result: Result, pairs: dict[str, Array] | None) -
             result.compared.setdefault("golden", []).append(part)
 
 
-def clock(evidence: Evidence, result: Result, fed_back: bool) -> None:
+def clock(evidence: Evidence, result: Result, complete: bool | None) -> None:
     """Compare the rate of the policy's steps with the control period.
 
     Args:
-        fed_back: whether previous actions in the observations show that no step is missing in the log.
+        complete: whether the log has every step; None: nothing shows it.
     """
     dt = evidence.manifest.dt
     steps = np.concatenate([np.diff(run.time) for run in evidence.runs])
@@ -62,8 +61,9 @@ def clock(evidence: Evidence, result: Result, fed_back: bool) -> None:
     # steps that alternate between two periods have a mean that tells more than their median
     if abs(ratio - 1) <= RATE:
         result.compared.setdefault("clock", []).append("rate")
-    elif ratio > 1.5 and abs(ratio - round(ratio)) <= RATE * round(ratio) and not fed_back:
-        result.notes.append(f"every_nth {round(ratio)} {1 / period:.4g} {1 / dt:.4g}")
+    elif ratio > 1.5 and abs(ratio - round(ratio)) <= RATE * round(ratio) and not complete:
+        kind = "slower_or_nth" if complete is None else "every_nth"
+        result.notes.append(f"{kind} {round(ratio)} {1 / period:.4g} {1 / dt:.4g}")
     else:
         result.findings.append(Finding("clock", "rate", (), 1 / period, 1 / dt))
     if late > GAPS:
@@ -82,13 +82,13 @@ def actions(evidence: Evidence, result: Result, normalised: bool) -> None:
         name: _left(seen, np.concatenate(answers), evidence.manifest.action_limit) for name, answers in inputs.items()
     }
     best = min(left, key=lambda name: left[name])
-    if best != "" and left[best] < CLOSE * left[""] and left[best] < CLOSE:
+    if best != "" and left[best] < EXPLAINS * left[""] and left[best] < EXPLAINS:
         if best == "normaliser_missing" and normalised:
             result.notes.append("log_is_normalised")
             result.findings[:] = [f for f in result.findings if f.kind != "normalised"]
         else:
             result.findings.append(Finding("action", best, (), None, None, left[best], left[""]))
-    answers = inputs[best] if left[best] < CLOSE * left[""] else inputs[""]
+    answers = inputs[best] if left[best] < EXPLAINS * left[""] else inputs[""]
     _against(evidence, result, seen, answers, names)
 
 
@@ -126,7 +126,7 @@ def _against(evidence: Evidence, result: Result, seen: Array, answers: list[Arra
     capped = _within(seen, whole, limit)
     relation = relate(capped, _shifts(answers), ())
     noisy = _noise(seen, whole, limit)
-    if relation is None or (float(np.mean(relation.left)) > CLOSE and noisy == 0):
+    if relation is None or (float(np.mean(relation.left)) > EXPLAINS and noisy == 0):
         result.findings.append(Finding("action", "other_policy", (), None, None, _left(seen, whole, limit)))
         return
     plain = relation.delay == 0 and relation.smooth == 1.0 and relation.order == tuple(range(len(names)))

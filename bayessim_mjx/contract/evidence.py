@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -24,7 +24,7 @@ class Finding:
         part: observation, action, command, clock or file. kind: what is wrong, a word of `words.SENTENCES`.
         entries: names; empty: all of the part. found, expected: numbers or words. before, left: error of the
             entries, or of the actions where no observation was logged, now and if this is mended, as a share of their
-            variance; None where it is not known.
+            variance; None where it is not known. each: {entry: (found, expected)} where entries share a finding.
     """
 
     part: str
@@ -34,6 +34,7 @@ class Finding:
     expected: float | str | None = None
     left: float | None = None
     before: float | None = None
+    each: Mapping[str, tuple[float | str, float | str]] = field(default_factory=dict)
 
 
 @dataclass

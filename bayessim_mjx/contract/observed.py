@@ -8,17 +8,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.contract import axes
+from bayessim_mjx.contract import axes, remainder
 from bayessim_mjx.contract.evidence import Evidence, Finding, Result
 from bayessim_mjx.contract.manifest import Entry
-from bayessim_mjx.contract.relate import DELAYS, TOLD, Relation, relate, unexplained
+from bayessim_mjx.contract.relate import DELAYS, EXPLAINS, TOLD, Relation, relate, unexplained
 from bayessim_mjx.contract.state import FRAMES, VECTORS
-from bayessim_mjx.contract.words import judge
+from bayessim_mjx.contract.words import judge, together
 
 Array = NDArray[np.float64]
 MOST = 0.8  # of the entries have to follow a rule that is meant for all; a rule of thumb
+UNLIKE = ("beyond", "unrelated", "offset", "scale")  # findings of a sine that is that of another angle
 SLOPE = 1.5  # factor between a measured velocity and the slope of the position over two steps; a rule of thumb
-OTHER = 0.1  # share of variance that another source may leave to be named; a rule of thumb
 
 
 def groups(entries: Sequence[Entry]) -> list[list[int]]:
@@ -88,16 +88,48 @@ def _group(evidence: Evidence, result: Result, entries: list[Entry], seen: Array
         and _commands_back(evidence, seen, entries)
     ):
         found = [Finding("observation", "command_fed_back", tuple(e.name for e in entries))]
+    found += [] if slopes else _beyond(entries, limited, relation, found)
     found = [f for f in found if not (slopes and _small(f))]
-    found += _others(evidence, entries, limited, relation, result)
+    found = _of_another_angle(evidence, entries, limited, relation, found, result)
+    found += _others(evidence, entries, limited, relation, found)
     for f in axes.merged(entries, seen, found, relation):
         own = [i for i, entry in enumerate(entries) if entry.name in f.entries]
         now, mended = (float(np.mean(share[own])) for share in (before, relation.left))
-        result.findings.append(replace(f, left=mended, before=now))
+        result.findings.append(replace(f, left=mended if f.left is None else f.left, before=now))
     bad = {name for f in found for name in f.entries}
     right = [e.name for e, told in zip(entries, relation.told, strict=True) if told and e.name not in bad]
     result.compared.setdefault("observation", []).extend(right)
     return relation
+
+
+def _beyond(entries: Sequence[Entry], seen: Array, relation: Relation, found: Sequence[Finding]) -> list[Finding]:
+    """Entries that nothing else is said of, and that go with their source but are not it."""
+    bad = {name for f in found for name in f.entries}
+    sizes = remainder.beyond(entries, seen, relation)
+    return [Finding("observation", "beyond", (name,), size, 0.0) for name, size in sizes.items() if name not in bad]
+
+
+def _of_another_angle(
+    evidence: Evidence,
+    entries: Sequence[Entry],
+    seen: Array,
+    relation: Relation,
+    found: Sequence[Finding],
+    result: Result,
+) -> list[Finding]:
+    """Say of sines and cosines that do not follow from their angle of which angle they are."""
+    named = {}
+    for i, entry in enumerate(entries):
+        wrong = any(entry.name in f.entries and f.kind in UNLIKE for f in found)
+        if wrong or result.untold.get(entry.name) == "noise":
+            named[entry.name] = remainder.named(evidence, entry, seen[:, i], float(relation.left[i]))
+    known = {name: answer for name, answer in named.items() if answer is not None}
+    for name in known:
+        result.untold.pop(name, None)
+    kept = [replace(f, entries=tuple(name for name in f.entries if name not in known)) for f in found]
+    own = together("observation", [(name, fault) for name, (fault, _) in known.items()])
+    mended = [replace(f, left=float(np.mean([known[name][1] for name in f.entries]))) for f in own]
+    return [f for f in kept if f.entries] + mended
 
 
 def _small(finding: Finding) -> bool:
@@ -127,7 +159,7 @@ def _commands_back(evidence: Evidence, seen: Array, entries: Sequence[Entry]) ->
         return False
     rows = np.isfinite(seen).all(1) & np.isfinite(expected).all(1)
     rest = np.mean((seen[rows] - expected[rows]) ** 2) if rows.any() else np.inf
-    return bool(rest < OTHER * np.mean(np.var(seen[rows], axis=0)))
+    return bool(rest < EXPLAINS * np.mean(np.var(seen[rows], axis=0)))
 
 
 def _apart(seen: Array, expected: Array, kind: str) -> Array:
@@ -145,10 +177,11 @@ def _left(seen: Array, expected: Array) -> Array:
 
 
 def _others(
-    evidence: Evidence, entries: Sequence[Entry], seen: Array, relation: Relation, result: Result
+    evidence: Evidence, entries: Sequence[Entry], seen: Array, relation: Relation, known: Sequence[Finding]
 ) -> list[Finding]:
     """Entries that follow from none of their group: another source of the manifest that explains them."""
-    names = {f.entries[0] for f in _unrelated(entries, seen, relation)}
+    named = {name for f in known if f.kind in ("unit", "offset", "other_source") for name in f.entries}
+    names = {f.entries[0] for f in _unrelated(entries, seen, relation)} - named
     found = []
     for i, entry in enumerate(entries):
         if entry.name not in names:
@@ -159,7 +192,7 @@ def _others(
             if values is not None:
                 left[other.name] = float(_left(seen[:, [i]], values)[0])
         best = min(left, key=lambda name: left[name], default="")
-        if best and left[best] < OTHER:
+        if best and left[best] < EXPLAINS:
             found.append(Finding("observation", "other_source", (entry.name,), best, entry.name))
     return found
 

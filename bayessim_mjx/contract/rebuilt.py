@@ -18,12 +18,11 @@ from bayessim_mjx.contract.evidence import Evidence, Finding, Result, shifted
 from bayessim_mjx.contract.manifest import Entry
 from bayessim_mjx.contract.observed import groups
 from bayessim_mjx.contract.recording import Run
+from bayessim_mjx.contract.relate import EXPLAINS, FLOOR
 from bayessim_mjx.contract.state import FRAMES, VECTORS, State
 
 Array = NDArray[np.float64]
 EXPLAINED = 0.02  # share of the actions' variance that a mistake may leave; a rule of thumb
-EXACT = 1e-6  # share that float32 and the digits of a log leave
-BETTER = 0.1  # factor by which it has to explain them better than no mistake; a rule of thumb
 ROWS = 600  # rows of each run that are tried: enough to tell mistakes apart; a rule of thumb
 
 # the sign of a source, before the default pose is subtracted or after it
@@ -42,14 +41,14 @@ def compare(evidence: Evidence, result: Result) -> bool:
         result.notes.append("not_rebuilt")
         return False
     best: tuple[float, Finding] | None = None
-    tried = base > EXACT and not evidence.network.memory
+    tried = base > FLOOR and not evidence.network.memory
     for finding, observations in _changes(evidence, runs) if tried else ():
         left = _left(evidence, [o[:ROWS] for o in observations], seen, limit)
         if left is not None and (best is None or left < best[0]):
             best = left, finding
-    if tried and (best is None or best[0] >= min(EXPLAINED, BETTER * base)):
+    if tried and (best is None or best[0] >= min(EXPLAINED, EXPLAINS * base)):
         best = min(filter(None, (best, _offset(evidence, seen, limit))), key=lambda found: found[0], default=None)
-    if best is not None and best[0] < min(EXPLAINED, BETTER * base):
+    if best is not None and best[0] < min(EXPLAINED, EXPLAINS * base):
         finding = best[1]
         result.findings.append(
             Finding("observation", finding.kind, finding.entries, finding.found, finding.expected, best[0], base)

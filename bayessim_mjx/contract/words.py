@@ -8,15 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayessim_mjx.contract import axes
+from bayessim_mjx.contract import axes, remainder
 from bayessim_mjx.contract.evidence import Finding, Result
 from bayessim_mjx.contract.manifest import Entry
-from bayessim_mjx.contract.relate import Relation
-from bayessim_mjx.quantities import compact, listed, percent
+from bayessim_mjx.contract.relate import CLEAR, Relation
+from bayessim_mjx.quantities import compact, listed, ordinal, percent
 
 Array = NDArray[np.float64]
 SAME = 0.02  # by which two numbers of one finding may differ, relatively; a rule of thumb
-CLEAR = 5.0  # times its noise: motion that has to show in what follows from it; a rule of thumb
 
 
 def judge(
@@ -51,7 +50,7 @@ def judge(
         else:
             found = []
         faults += [(entry.name, fault) for fault in found if fault.kind not in quiet]
-    return _together(part, _poses(faults, lines))
+    return together(part, _poses(faults, lines))
 
 
 def _poses(
@@ -80,7 +79,12 @@ def _still(entry: Entry, own: Array, base: Array, result: Result) -> list[axes.F
     moves = float(np.std(expected)) > limit
     if np.ptp(own) <= 1e-9 * max(1.0, abs(float(own[0]))) and moves:
         return [axes.Fault("frozen", float(own[0]), "")]
-    if moves and _clear(own) and _clear(expected):
+    if (
+        moves
+        and _clear(expected)
+        and remainder.slow(expected)
+        and (_clear(own) or remainder.contradicts(own, expected))
+    ):
         return [axes.Fault("unrelated", "", "")]
     result.untold[entry.name] = "still" if not moves else "noise"
     if entry.kind == "action":
@@ -107,16 +111,18 @@ def _clear(values: Array) -> bool:
     return float(np.std(values)) > CLEAR * noise
 
 
-def _together(part: str, faults: Sequence[tuple[str, axes.Fault]]) -> list[Finding]:
+def together(part: str, faults: Sequence[tuple[str, axes.Fault]]) -> list[Finding]:
     """One finding for all entries with the same fault."""
     found: list[Finding] = []
     for name, fault in faults:
         for k, other in enumerate(found):
             if other.kind == fault.kind and _alike(other, fault):
-                found[k] = replace(other, entries=(*other.entries, name))
+                each = {**other.each, name: (fault.found, fault.expected)}
+                found[k] = replace(other, entries=(*other.entries, name), each=each)
                 break
         else:
-            found.append(Finding(part, fault.kind, (name,), fault.found, fault.expected))
+            each = {name: (fault.found, fault.expected)}
+            found.append(Finding(part, fault.kind, (name,), fault.found, fault.expected, each=each))
     return found
 
 
@@ -142,6 +148,7 @@ SENTENCES = {
     "command_fed_back": "previous commands are fed back in place of actions",
     "other_source": "shows {found}",
     "unrelated": "follows from no logged source",
+    "beyond": "{found} (rms) off what its source, timing and noise explain",
     "frozen": "constant at {found} while its source moves",
     "sign": "sign is flipped",
     "unit": "in {found} in place of {expected}",
@@ -171,6 +178,10 @@ SENTENCES = {
     "golden_given": "the given pairs differ from the file's answers by {found}",
 }
 SWAPPED = "swapped"
+UNEQUAL = {  # of entries that share a finding and not its numbers
+    "scale": "scale {ratio} times the file's",
+    "frozen": "constant while the source moves",
+}
 MOTION = {
     "order": "they follow the commands of {found}",
     "sign": "moves against its command",
@@ -214,6 +225,9 @@ def sentence(finding: Finding) -> str:
     shown = abs(found) if kind in ("early", "delay", "scale") and isinstance(found, float) else found
     if finding.kind == "order" and len(finding.entries) == 2:
         return SWAPPED if finding.part != "motion" else f"drives {SWAPPED}"
+    unequal = len({(_text(found), _text(expected)) for found, expected in finding.each.values()}) > 1
+    if unequal and finding.kind in UNEQUAL:
+        return UNEQUAL[finding.kind].format(ratio=_text(float(found or 0) / float(expected or 1)))
     if finding.part == "motion":
         return MOTION[kind].format(entries=listed(finding.entries, most=MOST), found=found)
     return SENTENCES[kind].format(
@@ -260,9 +274,10 @@ def note(text: str) -> str:
                 "--manifest FILE"
             )
         return f"the file has no {rest[0]}; export it again"
-    if key == "every_nth":
+    if key in ("every_nth", "slower_or_nth"):
         n, here, there = rest
-        return f"steps are {here} Hz in place of {there} Hz: control is slower, or the log has every {n}th step only"
+        slower = "" if key == "every_nth" else "control is slower, or "
+        return f"rows are at {here} Hz in place of {there} Hz: {slower}the log has every {ordinal(int(n))} step only"
     return NOTES[key]
 
 
@@ -280,6 +295,8 @@ def verdict(result: Result) -> str:
         return "differs: the actions do not follow from the logged state"
     if not shows(result):
         return NOTHING
+    if unsettled(result):
+        return "unknown: the rate of control (see the note); what else was compared is right. Log every step"
     if result.untold:
         hidden = listed(list(result.untold), most=MOST)
         return f"the deployed policy is as its file says, except {hidden}, which the log does not show"
@@ -291,11 +308,18 @@ def unlike(result: Result) -> bool:
     return "rebuilt_unlike" in result.notes
 
 
+def unsettled(result: Result) -> bool:
+    """Whether control may be slower than the file says: nothing shows that the log lacks steps."""
+    return any(text.startswith("slower_or_nth") for text in result.notes)
+
+
 def outcome(result: Result) -> str:
-    """Return the verdict as a word: differs, right, or not compared."""
+    """Return the verdict as a word: differs, right, unknown (the rate of control), or not compared."""
     if result.findings or unlike(result):
         return "differs"
-    return "right" if shows(result) else "not compared"
+    if not shows(result):
+        return "not compared"
+    return "unknown" if unsettled(result) else "right"
 
 
 def _text(value: float | str | None) -> str:

@@ -20,6 +20,11 @@ def rewarded(task: str, given: Any) -> tuple[jax.Array, jax.Array, dict[str, jax
         _refuse(task, "reward", given, needed)
     if any(jnp.shape(x) != () for x in (*given[:2], *given[2].values())):
         _refuse(task, "reward", given, needed)
+    if jnp.issubdtype(jnp.result_type(given[1]), jnp.inexact):
+        raise UserError(
+            f"task {task}: `terminated` of `reward` is {jnp.result_type(given[1])}, but has to be bool, as "
+            "height < 0.2 is, or terminated > 0 (docs/own_task.md)"
+        )
     return tuple(given)
 
 

@@ -1,5 +1,6 @@
 """A folder ready for a model hub: policy.onnx, config.yaml, and README.md, a card with metadata and returns."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,9 @@ The command was:
 ```
 """
 
+# of this machine, before a file's name
+FOLDERS = re.compile(r"(?<![^\s='\"])(?:~|[A-Za-z]:)?[/\\](?:[^\s/\\:]+[/\\])*")
+
 
 def write(
     folder: Path, policy: Policy, env: Env, config: Config, returns: Mapping[str, Any], command: str = ""
@@ -90,7 +94,7 @@ def card(policy: Policy, env: Env, task: str, returns: Mapping[str, Any], comman
         actions=export.answer(policy, golden).shape[1],
         dt=env.dt,
         inputs=f"inputs = {{{', '.join(zeros)}}}",
-        command=command or "unknown",
+        command=FOLDERS.sub("", command) or "unknown",
     )
 
 

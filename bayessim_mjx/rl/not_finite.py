@@ -11,6 +11,7 @@ import numpy as np
 
 from bayessim_mjx.env.finite import shares
 from bayessim_mjx.errors import UserError
+from bayessim_mjx.quantities import percent
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env
@@ -48,11 +49,15 @@ def watch(env: Env, metrics: dict[str, Any], iteration: int, begins: bool, seen:
     found = dict(shares(metrics))
     new = {tag: words for tag, words in found.items() if metrics[tag] > 0 and tag not in seen}
     if begins:
-        _refuse(env, {words: metrics[tag] for tag, words in new.items()}, f"the first {iteration} iterations' steps")
+        _refuse(
+            env,
+            {words: metrics[tag] for tag, words in new.items()},
+            f"the steps of the first {iteration} iteration{'s' if iteration > 1 else ''}",
+        )
     for tag, words in new.items():
         seen[tag] = iteration
         warnings.warn(
-            f"task {env.name}: {words} is not finite in {metrics[tag]:.2g} of the steps, first before iteration "
+            f"task {env.name}: {words} is not finite in {percent(metrics[tag])} of the steps, first before iteration "
             f"{iteration}. 0 stands in its place, so that the policy may learn to reach these states. Stop and {DO}; "
             f"{tag} has the curve",
             stacklevel=3,
@@ -67,15 +72,15 @@ def evaluated(env: Env, lost: dict[str, Any]) -> None:
     for name, words in shares(lost):
         if (share := float(np.mean(lost[name]))) > 0:
             warnings.warn(
-                f"task {env.name}: {words} is not finite in {share:.2g} of the episodes that were evaluated, and 0 "
-                f"stands in its place; {DO}",
+                f"task {env.name}: {words} is not finite in {percent(share)} of the episodes that were evaluated, and "
+                f"0 stands in its place; {DO}",
                 stacklevel=4,
             )
 
 
 def _refuse(env: Env, found: dict[str, float], of: str) -> None:
     """UserError where a share is above 0."""
-    told = ", ".join(f"{words} in {share:.2g}" for words, share in found.items() if share > 0)
+    told = ", ".join(f"{words} in {percent(share)}" for words, share in found.items() if share > 0)
     if told:
         raise UserError(
             f"task {env.name}: not finite are {told} of {of}, in worlds that have not diverged; {DO} (docs/own_task.md)"

@@ -229,9 +229,15 @@ def find_runs(logdir: str | Path, task: str) -> list[Run]:
     return sorted(runs, key=lambda run: run.manifest.get("created", ""))
 
 
-def latest_run(logdir: str | Path, task: str, with_checkpoint: bool = True) -> Run:
-    """Find the newest run of a task (that has a checkpoint)."""
+def latest_run(logdir: str | Path, task: str, with_checkpoint: bool = True, trained: bool = False) -> Run:
+    """Find the newest run of a task (that has a checkpoint).
+
+    Args:
+        trained: pass over runs of no iteration, as of `--max_iterations 0`, where another run is there.
+    """
     runs = [run for run in find_runs(logdir, task) if run.checkpoints or not with_checkpoint]
+    if trained:
+        runs = [run for run in runs if run.manifest["latest"]] or runs
     if not runs:
         raise UserError(
             f"no run of {task!r} with a checkpoint under {Path(logdir) / _folder_name(task)}: give its folder by "

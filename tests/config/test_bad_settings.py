@@ -64,6 +64,8 @@ BAD = {
     "ppo.rnd.weight_schedule.mode=cosine": r"mode = 'cosine'.*allowed are constant, step, linear",
     "ppo.rnd.weight_schedule.mode=linear": r"weight_schedule\.initial_step is missing: mode linear needs it",
     "ppo.rnd.weight_schedule={mode: linear, initial_step: 9, final_step: 9, final_value: 0}": r"step = 9 must be",
+    "ppo.rnd={}": r"ppo\.rnd\.weight = 0: novelty adds no reward; give a weight above 0, or ppo\.rnd=null",
+    "ppo.symmetry.use_mirror_loss=True": r"ppo\.symmetry\.mirror_loss_coeff = 0 adds no loss; give a coefficient",
     "ppo.symmetry.use_mirror_loss=3": r"ppo\.symmetry\.use_mirror_loss = 3.*expected True or False",
     "bayessim.hiddenLayers=5": r"expected a list of whole numbers",
     "bayessim.hiddenLayers=[8,x]": r"bayessim\.hiddenLayers\[1\] = 'x'.*whole number",

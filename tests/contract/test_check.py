@@ -88,6 +88,15 @@ def test_mistakes_of_commands(case: str, policy: Path, tmp_path: Path) -> None:
     assert found(check(policy, tmp_path)) == {("command", *truth)}
 
 
+def test_a_common_factor_of_unequal_scales_is_a_ratio_with_each_entry_s_numbers(tmp_path: Path) -> None:
+    facts = robots.manifest() | {"action_scale": [0.5, 0.25]}
+    policy = robots.write_policy(tmp_path / "policy.onnx", facts)
+    robots.write_log(tmp_path / "logs" / "run.csv", command=lambda a: HOME + 0.7 * np.array([0.5, 0.25]) * a)
+    (finding,) = check(policy, tmp_path / "logs").findings
+    assert finding.kind == "scale" and words.sentence(finding) == "scale 0.7 times the file's"
+    assert finding.each == {"hip": (pytest.approx(0.35), 0.5), "knee": (pytest.approx(0.175), 0.25)}
+
+
 @pytest.mark.parametrize(
     ("acted", "kind"),
     [
@@ -190,3 +199,40 @@ def test_several_rows_for_each_step(policy: Path, tmp_path: Path) -> None:
     log.write_text("\n".join([head, *rows]) + "\n")
     result = check(policy, tmp_path)
     assert not result.findings and "rate" in result.compared["clock"]
+
+
+def thinned(log: Path, n: int) -> None:
+    """Keep every nth row."""
+    head, *lines = log.read_text().splitlines()
+    log.write_text("\n".join([head, *lines[::n]]) + "\n")
+
+
+def of_no_memory() -> dict[str, Any]:
+    """The manifest of a policy that is given speeds in place of its previous actions."""
+    facts = robots.manifest()
+    facts["observation_meaning"][10:] = [{"terms": {"qvel:hip": 0.05}, "offset": 0.0, "unit": "rad/s"}] * 2
+    return facts
+
+
+def test_half_the_rate_is_known_from_a_log_of_every_second_step(tmp_path: Path) -> None:
+    fed_back = robots.write_policy(tmp_path / "a.onnx")
+    robots.write_log(tmp_path / "slow" / "run.csv", dt=0.04)
+    (finding,) = check(fed_back, tmp_path / "slow").findings  # its previous actions are those of the row before
+    assert (finding.kind, finding.found) == ("rate", pytest.approx(25))
+    thinned(robots.write_log(tmp_path / "thin" / "run.csv", steps=800), 2)
+    result = check(fed_back, tmp_path / "thin")
+    assert words.outcome(result) == "right" and "the log has every 2nd step only" in words.note(result.notes[-1])
+    held = robots.write_log(tmp_path / "held" / "run.csv", dt=0.04)
+    head, *lines = held.read_text().splitlines()
+    rows = [f"{0.01 * (4 * k + i):.6g},{line.split(',', 1)[1]}" for k, line in enumerate(lines) for i in range(4)]
+    held.write_text("\n".join([head, *rows]) + "\n")
+    assert [f.kind for f in check(fed_back, tmp_path / "held").findings] == ["rate"]
+
+
+def test_a_rate_that_nothing_shows_is_unknown(tmp_path: Path) -> None:
+    policy = robots.write_policy(tmp_path / "b.onnx", of_no_memory())
+    speeds = changed(LAST, lambda m, k, x: 0.05 * m["v"][k][[0, 0]])
+    robots.write_log(tmp_path / "logs" / "run.csv", speeds, dt=0.04)
+    result = check(policy, tmp_path / "logs")
+    assert not result.findings and words.outcome(result) == "unknown"
+    assert words.verdict(result).startswith("unknown: the rate of control") and "2nd" in words.note(result.notes[-1])

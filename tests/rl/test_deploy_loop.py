@@ -66,6 +66,12 @@ def test_a_second_of_it_is_a_log_with_the_policys_commands(deploy, policy, file,
     assert np.std(log.ctrl) > 0.01 and log.metadata["checkpoint"] == 7 and log.metadata["note"] == "ran to its end"
 
 
+def test_a_task_of_another_package_needs_the_robots_model(deploy, policy, tmp_path, monkeypatch):
+    export.write(tmp_path / "own.onnx", policy, ENV, {"task": "Unheard"})
+    with pytest.raises(SystemExit, match="Unheard.*give --model FILE"):
+        run(deploy, monkeypatch, "--policy", tmp_path / "own.onnx", "--seconds", 0.1, "--out", tmp_path)
+
+
 def test_a_step_takes_its_time(deploy, file, tmp_path, monkeypatch):
     """On the clock half a second lasts half a second."""
     begun = time.perf_counter()

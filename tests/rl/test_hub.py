@@ -53,3 +53,10 @@ def test_nothing_is_overwritten(made):
     folder, policy, settings = made
     with pytest.raises(UserError, match=r"--hub .*: policy.onnx, config.yaml, README.md there already"):
         hub.write(folder, policy, registry.make("Pendulum"), settings, {})
+
+
+def test_the_card_has_no_folder_of_this_machine():
+    policy, env = pretrained.pretrained("Pendulum"), registry.make("Pendulum")
+    command = "train --task /home/ann/robots/acro.py:Acro cfg=/data/a.yaml ppo.gamma=0.9 rel/b.yaml"
+    card = hub.card(policy, env, "Pendulum", {"nominal physics": np.zeros(2)}, command)
+    assert "train --task acro.py:Acro cfg=a.yaml ppo.gamma=0.9 rel/b.yaml" in card

@@ -91,13 +91,13 @@ def test_a_world_that_diverged_counts_nowhere():
 
 def test_training_refuses_a_task_that_is_no_number_as_it_begins():
     env = Lost()
-    with pytest.raises(UserError, match=r"task Lost: .*observation group 'policy' in 1 of the worlds, at reset"):
+    with pytest.raises(UserError, match=r"task Lost: .*observation group 'policy' in 100 % of the worlds, at reset"):
         training.not_finite.at_reset(env, rl.init(env, CONFIG, jax.random.PRNGKey(0)))
     with pytest.raises(UserError) as error:
         rl.train(FarReward(), CONFIG, jax.random.PRNGKey(0), iterations=1)
     text = str(error.value)
-    assert text.startswith("task FarReward: not finite are the reward in ") and "the metric 'height' in 1 " in text
-    assert "the first 1 iterations' steps" in text and "own_task.md" in text
+    assert text.startswith("task FarReward: not finite are the reward in ") and "the metric 'height' in 100 % " in text
+    assert "the steps of the first 1 iteration" in text and "own_task.md" in text
 
 
 def test_later_it_is_told_once_with_its_first_iteration_and_has_a_curve():
@@ -111,7 +111,7 @@ def test_later_it_is_told_once_with_its_first_iteration_and_has_a_curve():
             training.not_finite.watch(env, row, 10 * (i + 1), i == 0, seen)
             kept.append(row)
     (only,) = caught
-    assert "FarReward: the reward is not finite in 0.25 of the steps, first before iteration 20." in str(only.message)
+    assert "FarReward: the reward is not finite in 25 % of the steps, first before iteration 20." in str(only.message)
     assert kept == [{}, {"Train/not_finite_reward": 0.25}, {"Train/not_finite_reward": 0.0}]
     assert seen == {"Train/not_finite_reward": 20}
 
@@ -119,6 +119,6 @@ def test_later_it_is_told_once_with_its_first_iteration_and_has_a_curve():
 def test_an_evaluation_warns_of_them():
     env = FarReward()
     policy = rl.policy_of(rl.init(env, CONFIG, jax.random.PRNGKey(0)))
-    with pytest.warns(UserWarning, match=r"the reward is not finite in 1 of the episodes") as caught:
+    with pytest.warns(UserWarning, match=r"the reward is not finite in 100 % of the episodes") as caught:
         found = rl.evaluate(env, policy, jax.random.PRNGKey(1), jnp.zeros((2, 0)))
     assert set(found) == {"return", "length"} and len(caught) == 2  # and the metric

@@ -215,7 +215,7 @@ def test_each_network_sees_the_groups_that_it_is_given():
         ({"memory_layers": 2}, "ppo.memory_layers = 2: there is no recurrent layer"),
         ({"gradient_length": 2}, "ppo.gradient_length = 2: there is no recurrent layer"),
         ({"activation": "maxout"}, "ppo.activation = 'maxout'.*lrelu, mish"),
-        ({"critic_groups": ("a",), "symmetry": {"use_mirror_loss": True}}, "ppo.critic_groups.*mirror maps"),
+        ({"critic_groups": ("a",), "symmetry": {"use_data_augmentation": True}}, "ppo.critic_groups.*mirror maps"),
     ],
 )
 def test_what_does_not_go_together_is_refused(settings, words):

@@ -237,8 +237,9 @@ def test_training_in_two_halves_is_training_at_once():
 
 def test_without_weight_it_changes_nothing_and_with_weight_it_does():
     """Its random numbers are its own: with weight 0 the policy is that of PPO alone, but for rounding."""
+    later = config(weight=0.0, weight_schedule=WeightSchedule("step", None, 10**9, 1.0))
     plain, idle, busy = (
-        rl.run(WALK, cfg, rl.init(WALK, cfg, key(0)), iterations=2)[0] for cfg in (CONFIG, config(weight=0.0), MOVING)
+        rl.run(WALK, cfg, rl.init(WALK, cfg, key(0)), iterations=2)[0] for cfg in (CONFIG, later, MOVING)
     )
     assert plain.extensions == {}
     assert_bitwise(plain.key, idle.key)

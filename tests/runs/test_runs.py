@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayessim_mjx import config, runs
+from bayessim_mjx import cli, config, runs
 from bayessim_mjx.distributions import Distribution
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -31,6 +31,20 @@ def test_folders_of_the_same_second_do_not_collide(tmp_path: Path) -> None:
     made = [Run.create(tmp_path, "Ant", "", config.load("Ant"), "") for _ in range(3)]
     assert len({run.path for run in made}) == 3
     assert runs.latest_run(tmp_path, "Ant", with_checkpoint=False).path == made[-1].path
+
+
+def test_the_best_is_that_of_the_newest_run_that_trained(tmp_path: Path) -> None:
+    made = [Run.create(tmp_path, "Ant", "", config.load("Ant"), "") for _ in range(3)]
+    for run, step, score in zip(made, (8, 8, 0), (98.5, 7.25, 300.0), strict=True):
+        run.save(step, tree(1), evaluation=score)
+    path, run_ = cli.find_checkpoint("best", "Ant", str(tmp_path))
+    assert run_ is not None and run_.path == made[1].path
+    of_all = cli.origin(path, run_, str(tmp_path))
+    assert (
+        of_all == f"run {made[1].path.name}, return 7.25, newest that trained, of 3 runs; --checkpoint RUN for another"
+    )
+    assert cli.origin(path, run_) == f"run {made[1].path.name}, return 7.25"
+    assert cli.find_checkpoint("latest", "Ant", str(tmp_path))[0].parents[1] == made[2].path
 
 
 def test_checkpoint_round_trip_is_bitwise(run: Run) -> None:

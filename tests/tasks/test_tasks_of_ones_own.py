@@ -177,6 +177,7 @@ def test_an_error_in_its_methods_names_the_line(tmp_path: Path) -> None:
          'world.measurement["qpos"]', ["`observe` returned an array of shape [1]", '{"policy": observation}']),
         ("jnp.zeros(1), jnp.zeros(1)", "jnp.zeros(1), jnp.zeros(2)",
          ["`initial` returned (an array of shape [1], an array of shape [2])", "of 1 and 1 numbers"]),
+        ("jnp.zeros((), bool), {}", "jnp.zeros(()), {}", ["`terminated` of `reward` is float32, but has to be bool"]),
         ("5.0 * action", "5.0 * action[0]", ["`command` returned a number", "a vector of 1"]),
     ],
 )  # fmt: skip

@@ -37,7 +37,7 @@ NOVEL = RNDConfig(
     reward_normalization=True, weight=2.0, learning_rate=0.05, obs_groups=("critic", "policy"),
     weight_schedule=WeightSchedule(mode="linear", initial_step=2, final_step=10, final_value=0.5),
 )  # fmt: skip
-DEFAULTS = PPOConfig(rnd=RNDConfig(weight_schedule=WeightSchedule()), symmetry=SymmetryConfig())
+DEFAULTS = PPOConfig(rnd=RNDConfig(weight=1.0, weight_schedule=WeightSchedule()), symmetry=SymmetryConfig())
 # other than the defaults, which are the second case
 CHANGED = {
     "sb3": COMMON | {"normalize_advantage_per_minibatch": True},
@@ -53,7 +53,7 @@ REFUSED = {
     "std_type": "scalar", "std_range": (0.1, 2.0), "state_dependent_std": True, "teacher": "run",
     "precision": "bfloat16",
     "extensions": ({"extension": "x"},), "action_bound": "tanh", "action_clip": 2.0, "weight_init": "lecun_uniform",
-    "symmetry": SymmetryConfig(), "rnd": RNDConfig(), "normalize_advantage_per_minibatch": True,
+    "symmetry": SymmetryConfig(), "rnd": RNDConfig(weight=1.0), "normalize_advantage_per_minibatch": True,
 }  # fmt: skip
 
 
@@ -102,7 +102,7 @@ def test_every_setting_is_read_back_from_the_agent(name, case):
     pytest.importorskip(NEEDED[name])
     changes = {"changed": CHANGED[name], "fixed": {"schedule": "fixed"}, "default": {}}[case]
     if case == "default" and name == "rsl_rl":  # sections with nothing set: on, and only logging
-        changes = {"rnd": RNDConfig(), "symmetry": SymmetryConfig()}
+        changes = {"rnd": RNDConfig(weight=1.0), "symmetry": SymmetryConfig()}
     whole = settings(name, **changes)
     agent = agents.make(whole, ENVS[name], None)
     found = READ[name](agent)
@@ -149,9 +149,17 @@ def test_what_is_not_taken_is_refused_by_name(name):
 @pytest.mark.parametrize(
     ("name", "ppo", "words"),
     [
-        ("rsl_rl", {"rnd": RNDConfig(activation="gelu")}, "ppo.rnd.activation = 'gelu': --agent rsl_rl takes elu"),
-        ("rsl_rl", {"rnd": RNDConfig(obs_groups=("nose",))}, "ppo.rnd.obs_groups: no group 'nose'"),
-        ("rsl_rl", {"rnd": RNDConfig(target_hidden_dims=())}, r"ppo.rnd.target_hidden_dims = \[\].*a hidden layer"),
+        (
+            "rsl_rl",
+            {"rnd": RNDConfig(weight=1.0, activation="gelu")},
+            "ppo.rnd.activation = 'gelu': --agent rsl_rl takes elu",
+        ),
+        ("rsl_rl", {"rnd": RNDConfig(weight=1.0, obs_groups=("nose",))}, "ppo.rnd.obs_groups: no group 'nose'"),
+        (
+            "rsl_rl",
+            {"rnd": RNDConfig(weight=1.0, target_hidden_dims=())},
+            r"ppo.rnd.target_hidden_dims = \[\].*a hidden layer",
+        ),
         ("rsl_rl", {"hidden_actor": ()}, r"ppo.hidden_actor = \[\]: --agent rsl_rl needs a hidden layer"),
         ("sb3", {"num_minibatches": 5}, "ppo.num_minibatches = 5: --agent sb3 takes a divisor of .* = 24"),
         ("sb3", {"num_minibatches": 24}, "ppo.num_minibatches = 24: .* at least two samples"),
@@ -162,6 +170,21 @@ def test_what_one_library_cannot_do_is_refused(name, ppo, words):
     pytest.importorskip(NEEDED[name])
     with pytest.raises(UserError, match=words):
         agents.check(settings(name, **ppo), ENVS[name])
+
+
+@pytest.mark.parametrize(("schedule", "factor"), [("adaptive", 1.5), ("fixed", 1.0)])
+def test_the_learning_rate_of_sb3_moves_where_its_schedule_is_adaptive(schedule, factor, tmp_path):
+    """Up in each iteration, as no update of the policy is nearly so large as this KL; a resumed agent goes on."""
+    pytest.importorskip(NEEDED["sb3"])
+    whole = settings("sb3", schedule=schedule, learning_rate=1e-4, desired_kl=100.0)
+    agent = agents.make(whole, ENVS["sb3"], None)
+    agent.learn(2)
+    figures = agent.learn(1)
+    assert figures["Loss/learning_rate"] == pytest.approx(1e-4 * factor**2)
+    agent.save(tmp_path)
+    again = agents.make(whole, ENVS["sb3"], None)
+    again.load(tmp_path)
+    assert again.rate == pytest.approx(1e-4 * factor**3)
 
 
 def test_observations_of_the_critics_own_are_refused_where_they_would_be_dropped():

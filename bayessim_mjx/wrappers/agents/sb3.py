@@ -1,4 +1,7 @@
-"""Stable-Baselines3's PPO. It has no learning rate by KL: an adaptive schedule becomes its `target_kl`."""
+"""Stable-Baselines3's PPO. It has no learning rate by KL: ours moves its rate once an iteration.
+
+`ppo.desired_kl` is its `target_kl` too, at 1.5 times of which it ends an iteration.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import numpy as np
 from bayessim_mjx.config import Config
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.rl import Policy
+from bayessim_mjx.rl.losses import adapt
 from bayessim_mjx.wrappers.agents import shared
 from bayessim_mjx.wrappers.agents.shared import Recent
 from bayessim_mjx.wrappers.sb3 import SB3VecEnv
@@ -61,6 +65,20 @@ def _normalised_once() -> Any:
     return Normalised
 
 
+def _by_kl(agent: SB3Agent) -> Any:
+    """Its callback that moves the learning rate before the next rollout, by the KL of the update before it."""
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    class ByKL(BaseCallback):
+        def _on_rollout_start(self) -> None:
+            agent.adapt()
+
+        def _on_step(self) -> bool:
+            return True
+
+    return ByKL()
+
+
 class SB3Agent:
     """`stable_baselines3.PPO` with `MlpPolicy` behind `VecNormalize`."""
 
@@ -82,6 +100,16 @@ class SB3Agent:
             vf_coef=ppo.value_loss_coef, max_grad_norm=ppo.max_grad_norm, seed=config.seed, device=_device(),
             target_kl=ppo.desired_kl if ppo.schedule == "adaptive" else None, policy_kwargs=self._networks(),
         )  # fmt: skip
+        self.rate = ppo.learning_rate
+        self.model.lr_schedule = lambda progress: self.rate
+
+    def adapt(self) -> None:
+        """Move the learning rate as ours moves in a minibatch, by the KL of the last update of this call of `learn`."""
+        kl = self.model.logger.name_to_value.get("train/approx_kl")
+        if kl is not None and self.config.ppo.schedule == "adaptive":
+            self.rate = float(adapt(self.rate, kl, self.config.ppo.desired_kl))  # type: ignore[arg-type]
+            for group in self.model.policy.optimizer.param_groups:  # as it is saved
+                group["lr"] = self.rate
 
     def _networks(self) -> dict[str, Any]:
         import torch
@@ -94,7 +122,8 @@ class SB3Agent:
     def learn(self, iterations: int) -> dict[str, float]:
         steps = iterations * self.config.ppo.num_steps * self.config.ppo.num_envs
         first = self.iteration == 0 and self.model.num_timesteps == 0
-        self.model.learn(steps, reset_num_timesteps=first, log_interval=None)  # type: ignore[arg-type]
+        self.model.learn(steps, reset_num_timesteps=first, log_interval=None, callback=_by_kl(self))  # type: ignore[arg-type]
+        self.adapt()
         self.iteration += iterations
         logged = self.model.logger.name_to_value
         found = {ours: float(logged[theirs]) for theirs, ours in TAGS.items() if theirs in logged}
@@ -124,6 +153,7 @@ class SB3Agent:
         kept = torch.load(folder / "model.pt", weights_only=True, map_location=self.model.device)
         self.model.set_parameters(kept, device=self.model.device)
         self.model.num_timesteps = 1  # not the first call of `learn`
+        self.rate = self.model.policy.optimizer.param_groups[0]["lr"]
         if self.config.ppo.normalize_observations:
             with np.load(folder / "scales.npz", allow_pickle=False) as scales:
                 for name in ("mean", "var", "count"):
