@@ -110,6 +110,15 @@ class BaseFlexibility(Cause):
             joint = base.add_joint(name=name, axis=axis, pos=[0, 0, -0.1], armature=0.1 * self.inertia)
             joint.stiffness[0], joint.damping[0] = k, 2 * self.zeta * math.sqrt(k * self.inertia)
 
+    def reset(self, plant: Simulated, command: np.ndarray) -> None:
+        """Before a run the mount carries the robot at rest."""
+        model, data = plant.model, plant.data
+        joints = [model.joint(name).id for name in ("base/x", "base/y")]
+        for _ in range(10):  # each leaves the share of the spring's moment that the weight makes by its tilt
+            mujoco.mj_forward(model, data)
+            moment = data.qfrc_bias[model.jnt_dofadr[joints]]
+            data.qpos[model.jnt_qposadr[joints]] = -moment / model.jnt_stiffness[joints]
+
     def parameters(self) -> dict[str, float]:
         return {"compliance": max(self.size, self.smallest)}
 

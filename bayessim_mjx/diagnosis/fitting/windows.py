@@ -13,7 +13,7 @@ from flax import struct
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.logcheck.noise import noise_of
-from bayessim_mjx.effects.support.motion import PAST, Motion
+from bayessim_mjx.effects.support.motion import AROUND, PAST, Motion
 from bayessim_mjx.errors import UserError
 from bayessim_mjx.logs.log import Log
 from bayessim_mjx.logs.resample import around as rows_around
@@ -125,7 +125,9 @@ def cut(
     even, centred = [resample(log, dt) for log in logs], centred and staggered(model)
     fine = [_fine_commands(log, e, dt, substeps, centred) for log, e in zip(logs, even, strict=True)]
     group_of, names = groups_of(logs, group)
-    starts = _starts(even, length, limit, _past(dt), enough) if starts is None else starts
+    if starts is None:
+        starts = _starts(even, length, limit, _before(PAST, dt))
+        starts = starts if len(starts) == limit else _starts(even, length, limit, _before(AROUND, dt), enough)
     if not starts:
         longest = max(len(e) - 1 for e in even)
         raise UserError(
@@ -165,7 +167,7 @@ def _batch(
     law: controllers.Law | None,
 ) -> Batch:
     """Return the windows of `length` rows at `starts`, for the simulator."""
-    around = _past(dt)
+    around = _before(PAST, dt)
     pick = np.asarray([r for r, _ in starts])
     return Batch(
         command=_stack([fine[r][_rows(even[r], a, length)] for r, a in starts]),
@@ -177,9 +179,9 @@ def _batch(
     )
 
 
-def _past(dt: float) -> int:
+def _before(seconds: float, dt: float) -> int:
     """Rows around a start that effects with memory look at."""
-    return max(2, int(np.ceil(PAST / dt)))
+    return max(2, int(np.ceil(seconds / dt)))
 
 
 def _starts(
