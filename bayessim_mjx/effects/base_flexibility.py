@@ -65,7 +65,9 @@ class BaseFlexibility(Effect):
         return {"tilt": none, "rate": none, "acceleration": none, "fresh": yes, "moving": no}
 
     def on_start(self, at: Site, memory: Any, motion: Motion, theta: jax.Array) -> tuple[Any, Motion]:
-        return memory | {"moving": jnp.ones((), bool)}, motion  # how it rocks is not known: as it is pushed just then
+        # how it rocks amid a recording is not known: as it is pushed just then; before the recording it rests
+        moving = jnp.ones((), bool) if motion.time is None else motion.time > 0
+        return memory | {"moving": moving}, motion
 
     def on_force(self, at: Site, memory: Any, step: SubStep, theta: jax.Array) -> tuple[Any, jax.Array]:
         compliance, frequency, ratio, depth = at.values(theta)[0]

@@ -145,8 +145,10 @@ class Simulator:
                 now = past.led(k, now)
                 new, data = control_step(self.physics, now, command[here], drive)
                 velocity = new.measurement["qvel"] + early(model) * data.qacc
-                if self._late:
-                    waits = (k >= lead) & (at < -back)
+                waits = (k >= lead) & (at < -back) if self._late else jnp.array(False)
+                if lead and own.around.time is not None:  # before a log begins nothing moves
+                    waits |= k < lead + back - jnp.round(own.around.time / jnp.float32(self.physics.dt))
+                if self._late or lead:
                     new = jax.tree.map(functools.partial(jnp.where, waits), now, new)
                 return new, (new.measurement["qpos"], velocity)
 

@@ -142,7 +142,7 @@ def test_impulses_of_commands_survive_fast_logs():
 def test_the_past_of_a_first_window_is_the_first_row_held():
     found = cut(LOGS)
     around, back = found.batch.around, found.batch.around.start
-    assert back == 5 and around.qpos.shape == (12, 2 * back + 1, 1) and found.start[0] == 0
+    assert back == 25 and around.qpos.shape == (12, 2 * back + 1, 1) and found.start[0] == 0
     np.testing.assert_allclose(around.qpos[0, : back + 1, 0], LOGS[0].qpos[0, 0], rtol=1e-6)
     np.testing.assert_allclose(around.qpos[0, back:, 0], LOGS[0].qpos[: back + 1, 0], rtol=1e-6)
     inner = int(np.flatnonzero(found.start > 0)[0])
