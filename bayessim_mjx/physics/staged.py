@@ -1,31 +1,40 @@
 """Effects whose force follows the state within a timestep, in the stages of a Runge-Kutta method."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.compat import mjx
-from bayessim_mjx.effects.support.substep import springs
+from bayessim_mjx.effects.support.substep import SubStep, springs
 from bayessim_mjx.physics.gates import gated
 from bayessim_mjx.physics.pushed import Memory
-
-if TYPE_CHECKING:
-    from bayessim_mjx.physics.timestep import Timestep
 
 
 class Staged:
     """The effects whose force is that of each stage (`Effect.rates`), and the part of their memory that stages move.
 
     Args:
-        own: the timestep; first: its data at the beginning, with the forces there; carry: memory and forces, likewise.
+        effects: (index, effect, site, slice of theta) of each; active: see `gates.gated`.
+        view: data -> the timestep as effects see it.
+        forcing: indices of all effects that exert a force.
+        first: data at the timestep's beginning, with the forces there; carry: memory and forces, likewise.
     """
 
-    def __init__(self, own: "Timestep", first: mjx.Data, carry: Memory) -> None:
-        self.own, self.effects, self.remembered = own, own.having("rates"), carry[0]
-        self.held = dict(zip(own.physics.having("on_force"), carry[1], strict=True))  # their forces at the beginning
-        self.others = first.qfrc_applied - sum((self.held[i] for i, *_ in self.effects), jnp.zeros_like(first.qvel))
-        self.first = tuple(effect.rates(at, self.remembered[i]) for i, effect, at, _ in self.effects)
+    def __init__(
+        self,
+        effects: Sequence[tuple],
+        active: jax.Array | None,
+        view: Callable[[mjx.Data], SubStep],
+        forcing: Sequence[int],
+        first: mjx.Data,
+        carry: Memory,
+    ) -> None:
+        self.effects, self.active, self.view, self.remembered = effects, active, view, carry[0]
+        self.held = dict(zip(forcing, carry[1], strict=True))  # their forces at the beginning
+        self.others = first.qfrc_applied - sum((self.held[i] for i, *_ in effects), jnp.zeros_like(first.qvel))
+        self.first = tuple(effect.rates(at, self.remembered[i]) for i, effect, at, _ in effects)
 
     def memory(self, rates: tuple, time: jax.Array) -> tuple:
         """Return the memory of all effects `time` after the beginning at these rates."""
@@ -39,7 +48,7 @@ class Staged:
         """Return (data with the forces of this stage in qfrc_applied, the rates there)."""
         if not self.effects:
             return data, ()
-        memory, step, active = self.memory(rates, time), self.own.view(data), self.own.drive.active
+        memory, step = self.memory(rates, time), self.view(data)
         known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + self.others
         known = known + springs(data)[1] if data._impl.ne else known
         found, total = [], self.others
@@ -50,7 +59,7 @@ class Staged:
                 left, force = effect.on_force(at, memory[i], seen, theta)
                 return effect.rates(at, left), force
 
-            there, pushing = gated(active, i, force, (own, jnp.zeros_like(self.others)))
+            there, pushing = gated(self.active, i, force, (own, jnp.zeros_like(self.others)))
             found.append(there)
             total = total + pushing
         return data.replace(qfrc_applied=total), tuple(found)

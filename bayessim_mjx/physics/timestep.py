@@ -267,7 +267,8 @@ def _rk4(own: Timestep, first: mjx.Data, memory: tuple, carry: Memory) -> tuple[
     model, dt = own.model, own.model.opt.timestep
     slope_of_ctrl = None if own.slope is None else _inside(own, first.ctrl, own.slope)
     flags = mjx.DisableBit(int(model.opt.disableflags) | _NO_DAMPING)
-    staged = Staged(own, first, carry)
+    forcing = own.physics.having("on_force")
+    staged = Staged(own.having("rates"), own.drive.active, own.view, forcing, first, carry)
 
     def moved(slope: tuple[Any, ...], time: jax.Array) -> mjx.Data:
         """`time` after the beginning, at this velocity and rate of the activations; qvel is not moved."""
