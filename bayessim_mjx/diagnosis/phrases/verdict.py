@@ -178,7 +178,7 @@ def _fill(d: Diagnosis) -> dict[str, str]:
     return {s: stage(far, s) for s in ("nominal", "calibrated", "with_effects")} | {
         "them": "it" if one else "them",
         "they": "the effect" if one else "the effects",
-        "reduce": "reduces" if one else "reduce",
+        "reduce": ("raise" if far.with_effects > far.calibrated else "reduce") + "s" * one,
         "explain": "explains" if one else "explain",
         "held": "parts of the log" if far.in_sample else "conditions",
         "one": "part of the log" if far.in_sample else "condition",

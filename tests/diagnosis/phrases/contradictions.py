@@ -84,14 +84,15 @@ def _levels(said: Said) -> Iterator[tuple[str, str]]:
 def _closed(said: Said) -> Iterator[tuple[str, str]]:
     """The share in the sentence on the fall of the gap, against the two gaps that the sentence quotes."""
     for sentence in said["sentences"]:
-        if not re.search(r"gap falls from|reduces? the gap from", sentence):
+        if not re.search(r"gap falls from|(reduces?|raises?) the gap from", sentence):
             continue
         levels = [float(x) for x in re.findall(rf"({NUMBER}) noise sd", sentence)]
         if len(levels) != 2:
             yield "words", f"two gaps are expected in: {sentence}"
             continue
-        if said["effects"] and levels[1] > levels[0]:
-            yield "words", f"the gap rises from {levels[0]} to {levels[1]}: {sentence}"
+        raised = bool(re.search("raises? the gap", sentence))
+        if said["effects"] and levels[1] != levels[0] and raised != (levels[1] > levels[0]):
+            yield "words", f"the gap {'falls' if raised else 'rises'} from {levels[0]} to {levels[1]}: {sentence}"
         quoted = re.search(rf"This closes ({NUMBER}) % of the squared gap above the noise", sentence)
         own = share(said["gap"]["calibrated"], said["gap"]["with_effects"])
         if quoted and said["effects"] and not math.isnan(own) and abs(float(quoted[1]) / 100 - own) > 0.02:

@@ -46,6 +46,7 @@ def test_no_made_up_result_contradicts_itself(name):
         ("one effect", "The simulator lacks", "No effect of the library explains", "words"),
         ("unexplained", "No effect of the library explains the gap", "The simulator lacks friction", "words"),
         ("parameters", "Only parameters are off", "The simulator lacks friction", "words"),
+        ("one effect", "the effect reduces the gap", "the effect raises the gap", "words"),
         ("a remainder", "More than the tolerance remains at", "Every joint is within its tolerance at", "words"),
         ("one effect", "Every joint is within its tolerance", "More than the tolerance remains at hinge", "words"),
         ("unexplained", "This force acts", "No candidate and no flexible force predicts it. It acts", "predicts"),

@@ -24,6 +24,8 @@ def test_the_gap_falls_by_the_share_that_its_two_numbers_give():
     falls = made("effects", [FRICTION], gap(with_effects=3.0)).sentences[1]
     assert falls.startswith("On held-out conditions the effect reduces the gap from 0.61 deg (1.1 % of the motion")
     assert falls.endswith("This closes 93 % of the squared gap above the noise.")
+    rises = made("unexplained", [FRICTION], gap(with_effects=10.8)).sentences
+    assert any(text.startswith("On held-out conditions the effect raises the gap from 0.61 deg") for text in rises)
 
 
 def test_the_promise_and_the_result_stand_together():
