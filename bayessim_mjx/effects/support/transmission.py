@@ -239,11 +239,10 @@ def sprung(at: Site, both: Sides, dt: float | jax.Array, soft: jax.Array, ratio:
     root = jnp.sqrt(jnp.where(period > 0, period, 1.0))
     loss = jnp.where(period > 0, 2 * ratio * root, 0.0)  # d / k = 2 zeta sqrt(J_s / k)
     squares = period / (dt**2 * (1 + period * both.kp / both.motor))
-    stiff = jnp.maximum(1.0 - squares, 0.0)
     if staggered(at.mj_model):
-        late = dt * stiff
+        late = dt * jnp.maximum(1.0 - squares, 0.0)
         return Spring(soft, late, late + loss, jnp.zeros(len(at)), jnp.ones(len(at)))
-    share = 0.5 * (1.0 + stiff)
+    share = 0.5 * (1.0 + jnp.maximum(1.0 - 4.0 * squares, 0.0))  # resolved up to omega dt = 2: it damps beyond
     late, over = share * share * dt, share * (share * dt + loss)
     return Spring(soft, late, over, (1.0 - share) * (share * dt + loss), share)
 
