@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Measurement: TypeAlias = dict[str, jax.Array]  # {"qpos": [nq], "qvel": [nv]}
 SHARE = 0.2  # of the joint's inertia is the motor's where the model has no armature
+FOX_GOODWIN = 1 / 12  # of the sub-step, what the slip at its end adds to the mean way; 1/4: implicit midpoint rule
 REAL = 2.0**-10  # armature below this part of the joint's inertia counts as none
 _EULER = int(mujoco.mjtIntegrator.mjINT_EULER)
 _IMPLICIT = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
@@ -219,12 +220,14 @@ class Passed(NamedTuple):
 class Spring(NamedTuple):
     """s of `transmit`, `[n]` each: soft s = (twist - rest) + ahead slip + over slip', looked at in the sub-step.
 
-    slip, slip': at its beginning and end; late: the part of `over` that is way; share: of slip' in the sub-step's way.
+    slip, slip': at its beginning and end; late, before: the part of `over` and `ahead` that is way; share: of slip' in
+    the sub-step's way.
     """
 
     soft: jax.Array
     late: jax.Array
     over: jax.Array
+    before: jax.Array
     ahead: jax.Array
     share: jax.Array
 
@@ -233,7 +236,8 @@ def sprung(at: Site, both: Sides, dt: float | jax.Array, soft: jax.Array, ratio:
     """Return springs of compliance `soft` 1/k `[n]`, damped by `ratio` of critical.
 
     A resolved spring is looked at where the sub-step begins, which costs no energy. By RK4, which has a state's numbers
-    all at one time, it is looked at in the middle (implicit midpoint rule). A stiff one is looked at where it ends.
+    all at one time, its mean is taken so that the frequency is right to the fourth order (Fox and Goodwin, 1949). A
+    stiff one is looked at where it ends.
     """
     period = jnp.where(both.on, soft * both.series, 0.0)  # J_s / k
     root = jnp.sqrt(jnp.where(period > 0, period, 1.0))
@@ -241,16 +245,18 @@ def sprung(at: Site, both: Sides, dt: float | jax.Array, soft: jax.Array, ratio:
     squares = period / (dt**2 * (1 + period * both.kp / both.motor))
     if staggered(at.mj_model):
         late = dt * jnp.maximum(1.0 - squares, 0.0)
-        return Spring(soft, late, late + loss, jnp.zeros(len(at)), jnp.ones(len(at)))
-    share = 0.5 * (1.0 + jnp.maximum(1.0 - 4.0 * squares, 0.0))  # resolved up to omega dt = 2: it damps beyond
-    late, over = share * share * dt, share * (share * dt + loss)
-    return Spring(soft, late, over, (1.0 - share) * (share * dt + loss), share)
+        none = jnp.zeros(len(at))
+        return Spring(soft, late, late + loss, none, none, none + 1.0)
+    stiff = jnp.maximum(1.0 - 4.0 * squares, 0.0)  # resolved up to omega dt = 2: it damps beyond
+    share, late = 0.5 * (1.0 + stiff), dt * (FOX_GOODWIN + (1.0 - FOX_GOODWIN) * stiff)
+    before = dt * (0.5 - FOX_GOODWIN) * (1.0 - stiff)
+    return Spring(soft, late, late + share * loss, before, before + (1.0 - share) * loss, share)
 
 
 def transmit(both: Sides, dt: float | jax.Array, spring: Spring, rest: jax.Array, held: jax.Array) -> Passed:
     """Solve motors and links together where `held` `[n]`; elsewhere nothing passes between them."""
     # motor: J (w' - w) = dt (tau - s - kp (late slip' + ahead of it) - kv (slip' - slip) - damped (v' - v) / dt)
-    late, over, before = spring.late, spring.over, (1.0 - spring.share) * spring.share * dt
+    late, over, before = spring.late, spring.over, spring.before
     slow = both.motor + dt * late * both.kp + dt * both.kv
     rigid = both.motor + both.damped
     drive = dt * both.torque + (both.motor + dt * both.kv - dt * before * both.kp) * both.slip
