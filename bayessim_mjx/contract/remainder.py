@@ -21,7 +21,7 @@ SUMS = (1.0, -1.0)
 
 
 def beyond(entries: Sequence[Entry], seen: Array, relation: Relation) -> dict[str, float]:
-    """{entry: rms of what is left} of those that do not follow from their source although they go with it.
+    """{entry: rms of the remainder} of those that do not follow from their source although they go with it.
 
     A value is right within the span of its source from one step before to one step after, with a scale of 1 +- NEAR, a
     constant, a step of quantised values, and axes that are turned by less than FLAT.

@@ -31,6 +31,12 @@ def together(physics: Physics, rows: tuple[jax.Array, ...]) -> jax.Array:
     return jnp.stack(every) if every else jnp.zeros((0, physics.mj_model.nv))
 
 
+def felt(data: mjx.Data, beside: jax.Array) -> jax.Array:
+    """Generalised force `[nv]` that effects see: passive, bias, actuators, equality constraints, and the one beside."""
+    known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + beside
+    return known + springs(data)[1] if data._impl.ne else known
+
+
 def pushed(
     physics: Physics, thetas: tuple[jax.Array, ...], drive: Drive, data: mjx.Data, carry: Memory, step: SubStep
 ) -> tuple[mjx.Data, Memory]:
@@ -43,8 +49,7 @@ def pushed(
         return data, carry
     memory, last = carry
     outside = jnp.zeros_like(data.qfrc_applied) if drive.force is None else drive.force
-    known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + outside
-    known = known + springs(data)[1] if data._impl.ne else known
+    known = felt(data, outside)
     forcing = physics.having("on_force")
 
     def hook(step: SubStep, i: int, of_effect: tuple, total: jax.Array) -> tuple[tuple, jax.Array]:
@@ -72,4 +77,4 @@ def pushed(
     return data.replace(qfrc_applied=total + outside), (remembered, tuple(force for _, force in each))
 
 
-__all__ = ["Memory", "apart", "pushed", "together"]
+__all__ = ["Memory", "apart", "felt", "pushed", "together"]

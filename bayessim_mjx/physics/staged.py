@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from bayessim_mjx.compat import mjx
-from bayessim_mjx.effects.support.substep import SubStep, springs
+from bayessim_mjx.effects.support.substep import SubStep
 from bayessim_mjx.physics.gates import gated
-from bayessim_mjx.physics.pushed import Memory
+from bayessim_mjx.physics.pushed import Memory, felt
 
 
 class Staged:
@@ -49,8 +49,7 @@ class Staged:
         if not self.effects:
             return data, ()
         memory, step = self.memory(rates, time), self.view(data)
-        known = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + self.others
-        known = known + springs(data)[1] if data._impl.ne else known
+        known = felt(data, self.others)
         found, total = [], self.others
         for (i, effect, at, theta), own in zip(self.effects, rates, strict=True):
 

@@ -139,7 +139,7 @@ def tables(out: Path, before: Path | None = None) -> str:
     by_error: list[Group] = [(f"{100 * e:g} %", lambda a, e=e: nearest(a.plan.scale) == e) for e in ERRORS]
     by_kind: list[Group] = [(k, lambda a, k=k: a.plan.kind == k) for k in ("single", "double")]
     by_system: list[Group] = [(s, lambda a, s=s: a.plan.system == s) for s in SEEDS]
-    examined: list[Group] = [
+    by_isolable: list[Group] = [
         (f"{k}, {'' if own else 'not '}isolable", lambda a, k=k, own=own: a.plan.kind == k and a.isolable is own)
         for k in ("single", "double") for own in (True, False)
     ]  # fmt: skip
@@ -149,9 +149,9 @@ def tables(out: Path, before: Path | None = None) -> str:
     ]  # fmt: skip
     by_logs: list[Group] = [(k, lambda a, k=k: a.plan.logs == k) for k in POOR]
     text = [
-        f"Data sheets of any accuracy\n\n{_table(sheets, [*by_kind, *examined, *by_system])}",
+        f"Data sheets of any accuracy\n\n{_table(sheets, [*by_kind, *by_isolable, *by_system])}",
         f"By the scale of the true errors\n\n{_table(sheets, by_error)}",
-        f"Few and poor logs\n\n{_table(logs, [*by_logs, *examined[:2]])}",
+        f"Few and poor logs\n\n{_table(logs, [*by_logs, *by_isolable[:2]])}",
         f"Nothing of the library\n\n{_outside(outside, by_system)}",
         f"Data sheets of any accuracy, by reality\n\n{_table(_of(every, 'sheets'), [*by_reality, *apart])}",
         f"Nothing of the library, by reality\n\n{_outside(_of(every, 'outside'), by_reality)}",
