@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
+from importlinter.cli import EXIT_STATUS_ERROR, EXIT_STATUS_SUCCESS, lint_imports
 
 ROOT = Path(__file__).parents[1]
 FILE, FUNCTION = 400, 60  # lines at most
@@ -209,6 +210,17 @@ def test_a_circle_is_found_however_it_is_closed(back: str) -> None:
     texts = {"room/__init__.py": "", "room/a.py": "import room.b\n", "room/b.py": typed, "room/c.py": back}
     assert circles(imports(texts)) == {frozenset({"room.a", "room.b", "room.c"})}
     assert circles(imports({**texts, "room/c.py": "import json\n"})) == set()
+
+
+def test_imports_point_the_way_that_pyproject_states(tmp_path) -> None:
+    assert lint_imports(str(ROOT / "pyproject.toml"), cache_dir=str(tmp_path)) == EXIT_STATUS_SUCCESS
+
+
+def test_an_import_that_points_upwards_is_found(tmp_path) -> None:
+    up = "type = forbidden\nsource_modules = bayessim_mjx.loop\nforbidden_modules = bayessim_mjx.physics\n"
+    text = f"[importlinter]\nroot_package = bayessim_mjx\n[importlinter:contract:up]\nname = up\n{up}"
+    (tmp_path / ".importlinter").write_text(text, encoding="utf-8")
+    assert lint_imports(str(tmp_path / ".importlinter"), cache_dir=str(tmp_path)) == EXIT_STATUS_ERROR
 
 
 def test_modules_of_the_package_are_imported_by_statements() -> None:

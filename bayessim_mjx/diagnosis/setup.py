@@ -27,8 +27,8 @@ from bayessim_mjx.diagnosis.fitting.quadratic import RULES
 from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts, pruned
 from bayessim_mjx.diagnosis.fitting.simulator import Simulator, physics_of
 from bayessim_mjx.diagnosis.fitting.windows import Windows
-from bayessim_mjx.diagnosis.logcheck import gate, noise
-from bayessim_mjx.diagnosis.phrases import notes
+from bayessim_mjx.diagnosis.logcheck import gate, noise, single_log
+from bayessim_mjx.diagnosis.phrases import notes, time_step
 from bayessim_mjx.diagnosis.request import Request, Tolerance, tolerances
 from bayessim_mjx.diagnosis.selection.numbers import Budget
 from bayessim_mjx.diagnosis.selection.search_state import Settings
@@ -199,9 +199,10 @@ def _checked(robot: Robot, logs: Sequence[Log], request: Request, looked: Callab
     beginnings, shorter = observation.shortened(found.demand(), seconds)
     whole, bases = observation.completed(beginnings, robot.mj_model)
     found = found.of_logs(whole)
+    robot = pruned(robot, found.usable, dt)
     said += [*found.warnings, *shorter, *found.findings]
     said += [] if noise.repeats(found.usable) else [notes.NO_REPEATS]
-    return _Checked(pruned(robot, found.usable, dt), dt, found, look, tuple(said), bases)
+    return _Checked(robot, dt, found, look, tuple(said), bases)
 
 
 def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | None, budget: Budget) -> _Timed:
@@ -215,8 +216,9 @@ def _timed(checked: _Checked, size: scales.Scales, limit: Array, group: str | No
     clocked = checked.gate if shift is None else checked.gate.moved(shift.lead)
     period, timestep = float(np.median([log.period for log in usable])), float(checked.robot.mj_model.opt.timestep)
     late = shift.notes(period) if shift is not None else []
-    said = [*steps.said(), *notes.rows(period, timestep, dt, dt <= 2 * CUTTING.shortest), *late]
-    return _Timed(step.robot(steps.robot), clocked, cuts, step, tuple(said), tuple(steps.warnings()))
+    said, warnings = time_step.sentences(steps)
+    said += [*notes.rows(period, timestep, dt, dt <= 2 * CUTTING.shortest), *late]
+    return _Timed(step.robot(steps.robot), clocked, cuts, step, tuple(said), tuple(warnings))
 
 
 def _measured(
@@ -248,7 +250,7 @@ def _measured(
 
 def _looked_at(logs: Sequence[Log], robot: Robot, dt: float, say: Callable[[Look], None]) -> tuple[gate.Gate, Look]:
     """Run the gate after the look, which is faster and said at once; again where the gate refuses more logs."""
-    sound = [log for log in logs if not gate.unusable(log, dt, len(logs))]
+    sound = [log for log in logs if not single_log.unusable(log, dt, len(logs))]
     seen = looked(sound, robot)
     if sound:
         say(seen)

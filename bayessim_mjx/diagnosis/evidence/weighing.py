@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from bayessim_mjx.diagnosis.evidence import doubts
+from bayessim_mjx.diagnosis.evidence import doubts, gaussian
 from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, Windows, learn, marginal, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import Integrated, Posterior, belief_of, integrated, unlikely
-from bayessim_mjx.diagnosis.fitting import forces as disturbance
 from bayessim_mjx.diagnosis.fitting.fit import Fit
 from bayessim_mjx.diagnosis.selection import heldout
 from bayessim_mjx.diagnosis.selection.models import BASE, Key, Model, scored
@@ -176,14 +175,14 @@ class Weighing:
 
     Attributes:
         scored: {set: its model with its evidence}; D: `[W, n, nv m]`, effect of forces on the windows
-            (`disturbance.columns`), at the fit of the known parameters. special: as in `weighed`.
+            (`gaussian.columns`), at the fit of the known parameters. special: as in `weighed`.
     """
 
     def __init__(self, state: SearchState) -> None:
         fitter = state.fitter
         self.state = state
-        self.scale = disturbance.force_scale(fitter)
-        self.D = disturbance.columns(fitter, state.base.fit, disturbance.default_nodes(fitter), self.scale)
+        self.scale = gaussian.force_scale(fitter)
+        self.D = gaussian.columns(fitter, state.base.fit, gaussian.default_nodes(fitter), self.scale)
         self.channels = int(fitter.used.sum())
         self.scored: dict[Key, Scored] = {}
         self.special: dict[Key, Key] = {}

@@ -23,7 +23,6 @@ from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors, held
 from bayessim_mjx.diagnosis.fitting.windows import Windows
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
-from bayessim_mjx.diagnosis.phrases import time_step
 from bayessim_mjx.diagnosis.statistics import AT_NOISE, of_one, of_rms
 from bayessim_mjx.logs.log import Channels, Log
 from bayessim_mjx.physics import Physics
@@ -99,41 +98,6 @@ class Discretisation:
         """Whether contacts make these windows too long to tell anything."""
         known = np.isfinite(self.sigma)
         return bool(np.median(self.floor[known] / self.sigma[known]) >= 1 / BELIEVED)
-
-    def warnings(self) -> list[str]:
-        """In words, where the simulator's own time step is worth more than the noise."""
-        nv = len(self.channels)
-        noises = self.own[:nv] / self.sigma[:nv]
-        if noises.max() < 1:
-            return []
-        at = int(np.argmax(noises))
-        size = "" if self.simulated[at] else f"{noises[at]:.1f} noise standard deviations, "
-        own = time_step.milliseconds(self.timestep, self.delivered.integrator if self.delivered else "")
-        text = time_step.COSTS.format(own=own, size=size, error=self.own[at], joint=self.channels[at])
-        return [text + self._remedy(noises[at], bool(self.simulated[at]))]
-
-    def _remedy(self, noises: float, simulated: bool) -> str:
-        known, used = np.isfinite(self.sigma), time_step.milliseconds(self.timestep / self.factor)
-        if self.delivered is not None:
-            left = np.max(self.left[known] / self.sigma[known])
-            return time_step.REPLACED.format(used=f"{self.integrator} at {used}", left=left)
-        finer = time_step.milliseconds(self.timestep / 2 ** int(np.ceil(np.log2(noises))))
-        text = time_step.REDUCES.format(finer="A shorter step" if simulated else f"A step of {finer}")
-        text += time_step.FINER.format(used=used) if self.factor > 1 else ""
-        if simulated:
-            return text + time_step.NO_NOISE
-        left = np.sqrt(np.maximum((self.floor[known] / self.sigma[known]) ** 2 - 1, 0.0)).max()
-        return text + time_step.COUNTS.format(rest=left) if left > ENOUGH else text
-
-    def beyond(self) -> list[str]:
-        """In words, where no step that can be afforded is fine enough: to be told before anything is fitted."""
-        nv = len(self.channels)
-        if self.limit is None or not (over := self.left[:nv] / self.limit).max() > 1:
-            return []
-        at, step = int(np.argmax(over)), 1e3 * self.timestep / self.factor
-        text = f"the simulator cannot be made fine enough: sub-steps of {step:.2g} ms still change the motion"
-        text += f" by {self.left[at]:.2g} rad or m at {self.channels[at]}, where {self.limit[at]:.2g} may stay"
-        return [f"{text}; smaller gaps are not seen"]
 
     def in_gap(self, nominal: float, otherwise: float) -> dict[str, float]:
         """Return the share that the delivered time step makes of the squared gap above the noise, where one is there.
@@ -211,6 +175,7 @@ def measure(
     at = {f: worth / gain**k for k, f in enumerate(factors)}
     settled = _size(settle(off), touching)
     base = np.hypot(sigma, np.tile(clean, 2) * settled)  # who simulated such logs may have used this step or another
+    shown = ENOUGH * np.where(np.isfinite(base), base, 0.0)
     factor = _choose({f: float(np.max(at[f] / base)) for f in factors if f <= max(first, most)})
     return Discretisation(
         timestep=float(physics.mj_model.opt.timestep),
@@ -220,7 +185,7 @@ def measure(
         settled=settled,
         left=at[factor],
         sigma=sigma,
-        floor=np.sqrt(base**2 + _excess(at[factor], base)),
+        floor=np.sqrt(base**2 + np.maximum(at[factor] ** 2 - shown**2, 0.0)),
         simulated=clean,
         channels=Channels.of(physics.mj_model).qvel,
         errors=errors,
@@ -252,12 +217,6 @@ def _choose(error: dict[int, float]) -> int:
     coarsest, finest = min(error), max(error)
     enough = [f for f, e in error.items() if e < ENOUGH]
     return min(enough) if enough else finest if error[finest] < ENOUGH * error[coarsest] else coarsest
-
-
-def _excess(error: Array, noise: Array) -> Array:
-    """Squares of errors beyond what does not show."""
-    known = np.isfinite(noise)
-    return np.maximum(error**2 - np.square(ENOUGH * noise, where=known, out=np.zeros_like(noise)), 0.0)
 
 
 def _size(error: Array, touching: bool) -> Array:

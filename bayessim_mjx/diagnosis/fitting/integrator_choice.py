@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayessim_mjx.diagnosis.fitting.cutting import CUTTING
-from bayessim_mjx.diagnosis.fitting.delivered import INTEGRATORS, Delivered
+from bayessim_mjx.diagnosis.fitting.delivered import Delivered
 from bayessim_mjx.diagnosis.fitting.discretisation import Discretisation, simulated
 from bayessim_mjx.diagnosis.fitting.observation import Stepper
 from bayessim_mjx.diagnosis.fitting.robot import Robot, contacts
@@ -66,20 +66,6 @@ class Step:
         model.opt.integrator = self.integrator
         return dataclasses.replace(robot, mj_model=model)
 
-    def sentences(self) -> list[str]:
-        """Sentences for the user before anything is fitted."""
-        if not self.joint:
-            return []
-        own, finer = 1e3 * self.timestep, 1e3 * self.timestep / self.factor
-        text = (
-            f"the simulator is unstable at its time step of {own:.3g} ms: {self.joint} is too stiff or too light for it"
-        )
-        if not self.reached:
-            mend = "more armature or damping, or a softer loop, at this joint would"
-            return [f"{text}, and for {finer:.3g} ms too; no gap can be trusted there ({mend})"]
-        how = f" by the integrator {INTEGRATORS[self.integrator]}" if self.changed else ""
-        return [f"{text}; the diagnosis simulates at {finer:.3g} ms or less{how}"]
-
 
 def coarsest_stable(model: mujoco.MjModel, logs: Sequence[Log], precise: bool = False) -> Step:
     """Return the coarsest stable step of a model, with its own integrator, or implicitfast where that may be coarser.
@@ -112,14 +98,6 @@ class Choice:
     cuts: Any
     worth: Discretisation
     better: tuple[str, ...] = ()
-
-    def said(self) -> list[str]:
-        """Sentences for the user before anything is fitted."""
-        return [*self.stable.sentences(), *self.better, *self.worth.beyond()]
-
-    def warnings(self) -> list[str]:
-        """Return the cost of the model's own step, where it can be simulated at all."""
-        return self.worth.warnings() if self.stable.factor == 1 else []
 
 
 def choose(robot: Robot, dt: float, logs: Sequence[Log], measured: Measured, left: float = np.inf) -> Choice:

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import glob
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -242,12 +243,7 @@ def default_space(model: mujoco.MjModel) -> ParameterSpace:
 
 
 def _scale(include: Sequence[str], within: tuple[float, float]) -> dict[str, Any]:
-    return {"range": list(within), "operation": "scaling", "include": [_literal(name) for name in include]}
-
-
-def _literal(name: str) -> str:
-    """Return the name as a pattern that matches nothing else."""
-    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
+    return {"range": list(within), "operation": "scaling", "include": [glob.escape(name) for name in include]}
 
 
 def _whole(model: mujoco.MjModel) -> str:

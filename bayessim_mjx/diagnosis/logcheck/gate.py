@@ -182,17 +182,8 @@ def check(logs: Sequence[Log], mj_model: mujoco.MjModel, dt: float) -> Gate:
     return Gate(reports, agreeing(seen, max([dt, *(r.log.period for r in usable)])), timing, crossed)
 
 
-def unusable(log: Log, dt: float, logs: int) -> bool:
-    """Whether one of so many logs is refused on its own, before it is compared with a model."""
-    return any(f.kind == "refused" for f in _alone(log, dt, logs))
-
-
-def _alone(log: Log, dt: float, logs: int) -> tuple[Finding, ...]:
-    return tuple(f for test in single_log.CHECKS for f in test(log, dt, logs))
-
-
 def _report(log: Log, mj_model: mujoco.MjModel, dt: float, logs: int) -> Report:
-    own = _alone(log, dt, logs)
+    own = single_log.alone(log, dt, logs)
     if any(f.kind == "refused" for f in own):
         return Report(log, own)  # nothing further can be computed from it
     found = () if log.lost else tuple(efforts(log, mj_model))  # forces on a joint need the motion of all

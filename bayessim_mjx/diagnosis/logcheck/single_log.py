@@ -171,3 +171,13 @@ def _speed(log: Log, column: int) -> Array:
 
 
 CHECKS = (size, jitter, constant, wrapped)  # of (log, control period, how many logs there are)
+
+
+def alone(log: Log, dt: float, logs: int) -> tuple[Finding, ...]:
+    """Return what shows in one of so many logs on its own, before it is compared with a model."""
+    return tuple(f for test in CHECKS for f in test(log, dt, logs))
+
+
+def unusable(log: Log, dt: float, logs: int) -> bool:
+    """Whether one of so many logs is refused on its own."""
+    return any(f.kind == "refused" for f in alone(log, dt, logs))

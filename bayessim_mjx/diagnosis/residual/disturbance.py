@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from bayessim_mjx.diagnosis.evidence import gaussian
 from bayessim_mjx.diagnosis.evidence.gaussian import Hyper, Learnt, learn, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
-from bayessim_mjx.diagnosis.fitting import forces
 from bayessim_mjx.diagnosis.fitting.fitter import Fit, Fitter
 from bayessim_mjx.diagnosis.fitting.quadratic import Quadratic, eliminate
 from bayessim_mjx.diagnosis.selection.numbers import EFFORT, ODDS, PRIORS
@@ -54,11 +54,11 @@ def linearise(fitter: Fitter, fit: Fit, knots: int | None = None, D: Array | Non
     Args:
         knots: m, None: as many as are cheap; D: columns of another fit of these windows, to save the simulations.
     """
-    knots = forces.default_nodes(fitter) if knots is None else knots
-    scale = forces.force_scale(fitter)
-    D = forces.columns(fitter, fit, knots, scale) if D is None else D
+    knots = gaussian.default_nodes(fitter) if knots is None else knots
+    scale = gaussian.force_scale(fitter)
+    D = gaussian.columns(fitter, fit, knots, scale) if D is None else D
     q, _ = eliminate(fit.r, np.concatenate([fit.A, D], 2), fit.B, fit.offsets, fit.spread)
-    return Linear(D, forces.node_basis(fitter.simulator.windows.steps, D.shape[2] // len(scale)), scale, q)
+    return Linear(D, gaussian.node_basis(fitter.simulator.windows.steps, D.shape[2] // len(scale)), scale, q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +195,7 @@ def origin(
     nodes, steps = D.shape[2] // len(sizes), r.shape[1] // channels
     D = D * np.repeat(sizes, nodes)  # a force of 1 N m is much for a wrist and little for a shoulder
     even, clock = _white(*(x.reshape(len(r), steps, channels) for x in (r, np.zeros_like(r) if rate is None else rate)))
-    kept = np.arange(0, steps, -(-steps // forces.SIZES.columns))  # noise of a row is as large there
+    kept = np.arange(0, steps, -(-steps // gaussian.SIZES.columns))  # noise of a row is as large there
     rows, steps = (kept[:, None] * channels + np.arange(channels)).ravel(), len(kept)
     own = np.unique(np.linspace(0, len(r) - 1, min(len(r), EFFORT.windows)).round().astype(np.int64))
     r, B, D, clock, weight = r[own][:, rows], B[own][:, rows], D[own][:, rows], clock[own][:, kept], weight[own]

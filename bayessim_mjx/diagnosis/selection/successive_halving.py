@@ -130,19 +130,22 @@ def fit_entries(
     total, done = sum(len(several) for several, _ in entries.values()), 0
     every = list(entries.items())
     leading = min((model.fit for model in parents.values()), key=lambda fit: fit.cost, default=state.base.fit)
-    own = ranked_on(leading)
+    few = len(leading.r) < EFFORT.windows  # then extensions are ranked on all of them
+    own = None if few else looked_at(leading, EFFORT.windows // 2)
     for first in range(0, len(every), EFFORT.batch):
         some = dict(every[first : first + EFFORT.batch])
         if part and state.settings.budget.over(part) and (first or part != SINGLES):
-            _left_out(state, [effects for _, (_, effects) in every[first:]], label)
+            late = [effects for _, (_, effects) in every[first:]]
+            state.cut_short.update(effects[0].label for effects in late if len(effects) == 1)
+            state.skipped[label] = state.skipped.get(label, 0) + len(late)
             return
         done += sum(len(several) for several, _ in some.values())
-        _fit_batch(state, some, parents, own, (halving, finals), functools.partial(_say_left, say, label, done, total))
+
+        def progress(left: int, begun: int = done) -> None:
+            say(label, begun - left, total)
+
+        _fit_batch(state, some, parents, own, (halving, finals), progress)
         state.keep(state)
-
-
-def _say_left(say: Progress, label: str, done: int, total: int, left: int) -> None:
-    say(label, done - left, total)
 
 
 def _fit_batch(
@@ -183,17 +186,12 @@ def _gaining(
     share, out = len(own) / len(state.base.fit.r), []
     for key, fit in fits.items():
         parent = parents.get(key)
-        before = np.inf if parent is None else cost_on(part, parent.fit, own)
+        some = None if parent is None else cut(parent.fit, own)
+        before = np.inf if some is None else part.cost(some, some.r, some.offsets, some.values)
         more = key - {e.label for e in parent.effects} if parent else frozenset()
         if before - fit.cost > -2.0 * share * state.log_prior(more):
             out.append(key)
     return out
-
-
-def _left_out(state: SearchState, models: Sequence[Sequence[Candidate]], label: str) -> None:
-    """Record the models for which no time was left."""
-    state.cut_short.update(effects[0].label for effects in models if len(effects) == 1)
-    state.skipped[label] = state.skipped.get(label, 0) + len(models)
 
 
 class WindowSubset:
@@ -212,11 +210,6 @@ class WindowSubset:
         return np.asarray(self.simulator.run(thetas, offsets, self.own if windows is None else self.own[windows]))
 
 
-def ranked_on(fit: Fit) -> NDArray[np.int64] | None:
-    """Return the windows on which extensions of a fit are ranked; None: all, as there are few."""
-    return looked_at(fit, EFFORT.windows // 2) if len(fit.r) >= EFFORT.windows else None
-
-
 def fitter_on(fitter: Fitter, own: NDArray[np.int64]) -> Fitter:
     """Return the fitter on some of its windows; it uses the same journal, but stores no columns there."""
     some: Any = WindowSubset(fitter.simulator, own)
@@ -228,12 +221,6 @@ def fitter_on(fitter: Fitter, own: NDArray[np.int64]) -> Fitter:
 def cut(fit: Fit, own: NDArray[np.int64]) -> Fit:
     """Return the start of a fit to some of the windows."""
     return replace(part(fit, own), cost=np.inf, history=(), reach=np.ones(1))
-
-
-def cost_on(part: Fitter, fit: Fit, own: NDArray[np.int64]) -> float:
-    """Return the cost on some windows of a fit to all windows."""
-    some = cut(fit, own)
-    return part.cost(some, some.r, some.offsets, some.values)
 
 
 def back(fit: Fit, ranked: Fit, own: NDArray[np.int64]) -> Fit:

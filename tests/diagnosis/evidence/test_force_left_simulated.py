@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from bayessim_mjx.diagnosis.evidence import gaussian
 from bayessim_mjx.diagnosis.evidence.force_left import force_left
 from bayessim_mjx.diagnosis.evidence.gaussian import learn, windows_of
 from bayessim_mjx.diagnosis.evidence.parameters import belief_of
-from bayessim_mjx.diagnosis.fitting import forces as disturbance
 from tests.diagnosis.missing_forces import fitted, record
 
 pytestmark = [pytest.mark.slow, pytest.mark.ci]  # whole fits
@@ -15,8 +15,8 @@ RMS = 0.04  # N m
 
 def left(logs):
     fitter, fit = fitted(logs)
-    scale = disturbance.force_scale(fitter)
-    D = disturbance.columns(fitter, fit, disturbance.default_nodes(fitter), scale)
+    scale = gaussian.force_scale(fitter)
+    D = gaussian.columns(fitter, fit, gaussian.default_nodes(fitter), scale)
     windows = windows_of(fit.r, fit.A, fit.B, D, fit.offsets, fit.spread, scale, int(fitter.used.sum()))
     return force_left(windows, belief_of(fit), learn(windows, belief_of(fit)), scale)
 

@@ -18,6 +18,7 @@ from bayessim_mjx.diagnosis.fitting.delivered import Delivered
 from bayessim_mjx.diagnosis.fitting.quadratic import eliminate
 from bayessim_mjx.diagnosis.fitting.substep_errors import Errors
 from bayessim_mjx.diagnosis.logcheck.noise import noise_free
+from bayessim_mjx.diagnosis.phrases import time_step
 from bayessim_mjx.diagnosis.setup import _measured
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 from bayessim_mjx.parameters import Parameter, ParameterSpace
@@ -124,7 +125,7 @@ def test_fast_motion_is_simulated_more_finely_until_the_step_does_not_show():
     true = np.sqrt(np.maximum(left[1] ** 2 - NOISE**2, 0.0))  # the time step's part, told beforehand within a third
     told = found.left * found.factor
     assert told[:2].max() == pytest.approx(true.max(), rel=0.35)
-    (text,) = found.warnings()
+    (text,) = time_step.costs(found)
     assert (
         "time step of 5 ms" in text
         and "noise standard deviations" in text
@@ -139,7 +140,7 @@ def test_fast_motion_is_simulated_more_finely_until_the_step_does_not_show():
 def test_the_integrator_that_is_recommended_leaves_nothing():
     """RK4 at the same step: commands act when they are sent, and velocities are those of the positions' time."""
     found, left = measured(the(ARM.replace("implicitfast", "RK4")), logs(ARM, swing))
-    assert found.factor == 1 and (found.own[:2] / NOISE).max() < 0.1 and not found.warnings()
+    assert found.factor == 1 and (found.own[:2] / NOISE).max() < 0.1 and not time_step.costs(found)
     assert (left[1] / NOISE).max() < 1.05  # nothing but the sensors' noise
 
 
@@ -149,7 +150,7 @@ def test_without_noise_the_step_itself_is_the_floor(finer):
     assert found.simulated.all()
     assert (left[min(found.factor, 4)] / found.floor[:2]).max() < 1.2
     assert (left[1] / found.sigma[:2]).max() > 10  # a huge gap, were the floor the sensors' alone
-    assert "show no noise" in found.warnings()[0]
+    assert "show no noise" in time_step.costs(found)[0]
 
 
 def test_noise_is_seen_whatever_the_motion():
@@ -210,10 +211,10 @@ def test_what_is_left_beyond_the_tolerance_is_told():
     none, sigma = np.zeros(4), np.full(4, 1e-3)
     left = np.array([1e-3, 8e-3, 0.0, 0.0])
     given = (0.01, 8, 1.0, none, none, left, sigma, sigma, np.zeros(2, bool), ("a", "b"))
-    (text,) = discretisation.Discretisation(*given, limit=np.full(2, 2e-3)).beyond()
+    (text,) = time_step.beyond(discretisation.Discretisation(*given, limit=np.full(2, 2e-3)))
     assert "sub-steps of 1.2 ms still change the motion by 0.008 rad or m at b, where 0.002 may stay" in text
-    assert not discretisation.Discretisation(*given, limit=np.full(2, 1e-2)).beyond()
-    assert not discretisation.Discretisation(*given).beyond()
+    assert not time_step.beyond(discretisation.Discretisation(*given, limit=np.full(2, 1e-2)))
+    assert not time_step.beyond(discretisation.Discretisation(*given))
 
 
 def chosen(recorded, limit, *left, xml=ARM):
@@ -232,7 +233,7 @@ def test_where_nothing_touches_the_integrator_is_runge_and_kuttas(noise):
     """A tolerance of a fiftieth of the noise: 3e-6 rad of a swing of two radians."""
     found, tried = chosen(logs(ARM, swing, noise=noise), 0.02 * noise)
     assert tried == [mujoco.mjtIntegrator.mjINT_RK4] == [found.robot.mj_model.opt.integrator]
-    assert not found.said()
+    assert not time_step.sentences(found)[0]
     assert found.worth.believed > 0.9
 
 
@@ -243,7 +244,7 @@ def test_the_error_is_that_of_the_delivered_integrator_where_the_diagnosis_has_a
     since = PERIOD * np.arange(1, 51)
     assert found.worth.own[0] == pytest.approx(3.0 / 2.0 * STEP / 2 * np.sqrt(np.mean(since**2)), rel=0.002)
     assert (found.worth.left[:1] / found.worth.sigma[:1]).max() < 0.01
-    (text,) = found.warnings()
+    (text,) = time_step.sentences(found)[1]
     assert "time step of 5 ms (Euler) costs" in text and "The diagnosis simulates by RK4 at 5 ms, which leaves" in text
 
 
@@ -305,7 +306,7 @@ def test_where_time_is_limited_the_integrator_stays_unless_a_search_by_the_bette
     found, tried = chosen(logs(ARM, swing, noise=1e-5), 0.05, 1e-6)
     assert tried == [mujoco.mjtIntegrator.mjINT_RK4, mujoco.mjtIntegrator.mjINT_IMPLICITFAST]
     assert found.robot.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    assert integrator_choice.TOO_LONG in found.said()
+    assert integrator_choice.TOO_LONG in time_step.sentences(found)[0]
 
 
 def test_logs_of_a_simulation_keep_its_integrator():

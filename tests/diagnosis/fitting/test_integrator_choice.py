@@ -8,6 +8,7 @@ import pytest
 
 from bayessim_mjx.diagnosis.fitting import integrator_choice
 from bayessim_mjx.diagnosis.fitting import robot as robots
+from bayessim_mjx.diagnosis.phrases import time_step
 from bayessim_mjx.diagnosis.setup import _measured
 from bayessim_mjx.logs import Channels, Log, estimate_velocity
 
@@ -37,9 +38,9 @@ def test_a_spring_asks_for_half_its_time_constant(kind):
     assert needed(model(0.018, kind, 1e4)).factor == 1
     found = needed(model(0.05, kind, 1e4))
     assert found.factor == 4 and found.joint == "rail" and found.reached and not found.changed
-    (text,) = found.sentences()
+    (text,) = time_step.unstable(found)
     assert "unstable at its time step of 50 ms: rail" in text and "12.5 ms" in text
-    assert needed(model(0.018, kind, 1e4)).sentences() == []
+    assert time_step.unstable(needed(model(0.018, kind, 1e4))) == []
 
 
 def test_loops_are_springs_too():
@@ -54,7 +55,7 @@ def test_a_nearly_massless_axis_is_left_to_the_implicit_integrator():
     """A velocity loop of 1 N s/m on 0.1 g: explicitly stable below 2e-4 s, implicitly at any step."""
     servo = '<velocity name="motor" joint="rail" kv="1"/>'
     found = needed(model(0.01, mass=1e-4, actuator=servo))
-    assert found.changed and found.factor == 1 and "implicitfast" in found.sentences()[0]
+    assert found.changed and found.factor == 1 and "implicitfast" in time_step.unstable(found)[0]
     changed = found.robot(robots.robot_of(model(0.01, mass=1e-4, actuator=servo)))
     assert changed.mj_model.opt.integrator == integrator_choice.IMPLICITFAST
     assert needed(model(0.01, damping=1.0, mass=1e-4)).factor == 1  # a joint's damping is implicit in Euler's method
@@ -79,7 +80,7 @@ def test_what_falls_over_is_not_unstable():
 def test_what_no_step_reaches_is_said():
     found = needed(model(0.01, stiffness=1e10, mass=1e-3))
     assert not found.reached and found.factor == integrator_choice.FINEST
-    assert "for 0.156 ms too" in found.sentences()[0] and "armature" in found.sentences()[0]
+    assert "for 0.156 ms too" in time_step.unstable(found)[0] and "armature" in time_step.unstable(found)[0]
 
 
 @pytest.mark.slow
@@ -107,5 +108,5 @@ def test_a_loop_that_the_simulators_step_cannot_hold_is_simulated_to_within_the_
     assert step.factor > 1 and step.reached
     robot = dataclasses.replace(robots.robot_of(own), control_dt=period)
     _, found = _measured(robot.physics(period), logs, None, False, np.full(1, 3 * noise), step.factor)
-    assert found.factor >= step.factor and not found.beyond()
+    assert found.factor >= step.factor and not time_step.beyond(found)
     assert found.left[0] < noise and found.floor[0] < 1.5 * noise

@@ -173,7 +173,7 @@ def steps():
         dict(factor=2, left=one, floor=2 * one, simulated=noisy),
         dict(factor=1, left=one, floor=7 * one, simulated=quiet),
     ]
-    return [text for more in made for text in Discretisation(**given, **more).warnings()]
+    return [text for more in made for text in time_step.costs(Discretisation(**given, **more))]
 
 
 def warnings():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bayessim_mjx.diagnosis.fitting.forces import node_basis
+from bayessim_mjx.diagnosis.evidence.gaussian import node_basis
 from bayessim_mjx.diagnosis.residual import disturbance as d
 from tests.diagnosis.missing_forces import fitted, known, record
 
