@@ -84,6 +84,6 @@ def update(
         "Policy/mean_std": student.law.sd(*student.distribution(groups)).mean(),
         "env_steps": after.env_steps,
         **episodes.metrics(after.episodes),
-        **episodes.terms(data),
+        **episodes.of_steps(data),
     }
     return sharding.pinned(after, state.mesh, ppo.layout(after)), metrics

@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from bayessim_mjx.env.finite import NOT_FINITE
+from bayessim_mjx.physics.warp import OVERFLOW
 from bayessim_mjx.rl.sharding import FIRST
-from bayessim_mjx.rollout.collection import TERM, kept
 
 WINDOW = 100
+TERM = "reward_"  # how metrics are called that are parts of the reward
 
 
 @struct.dataclass
@@ -71,15 +73,17 @@ def metrics(episodes: Episodes) -> dict[str, jax.Array]:
     }
 
 
-def tags_of_terms(metrics: dict[str, Any]) -> dict[str, str]:
-    """{tag: metric} of those of a task's metrics that collection keeps."""
-    return {_tag(name): name for name in metrics if kept(name)}
+def tags_of_steps(metrics: dict[str, jax.Array]) -> dict[str, str]:
+    """{tag: metric} of those of a task's metrics, `[N, ...]`, that are one number a world."""
+    return {_tag(name): name for name, x in metrics.items() if x.ndim == 1}
 
 
 def _tag(name: str) -> str:
-    return f"Reward/{name.removeprefix(TERM)}" if name.startswith(TERM) else f"Train/{name}"
+    if name.startswith(TERM):
+        return f"Reward/{name.removeprefix(TERM)}"
+    return f"{'Train' if name == OVERFLOW or name.startswith(NOT_FINITE) else 'Metric'}/{name}"
 
 
-def terms(data: dict[str, Any]) -> dict[str, jax.Array]:
-    """Mean per step of each of these metrics, of what was collected."""
-    return {tag: data["terms"][name].mean() for tag, name in tags_of_terms(data["terms"]).items()}
+def of_steps(data: dict[str, Any]) -> dict[str, jax.Array]:
+    """Mean per step of each of the task's metrics, of what was collected."""
+    return {_tag(name): x.mean() for name, x in data["metrics"].items()}

@@ -181,7 +181,7 @@ def update(
         "Policy/mean_std": _spread(config, params, batch),
         "env_steps": after.env_steps,
         **episodes.metrics(after.episodes),
-        **episodes.terms(data),
+        **episodes.of_steps(data),
     }
     for extension in learner.extensions:
         shown = extension.metrics(states.get(extension.name), metrics, learner)

@@ -55,7 +55,7 @@ def _make_chunk(env: Env, config: PPOConfig, distils: bool = False) -> Any:
     latest = {*LATEST, *(tag for extension in catalogue.active(config) for tag in extension.latest)}
 
     def chunk(state: TrainState, given: tuple, count: jax.Array) -> tuple[TrainState, Metrics]:
-        announced = (*reported, *episodes.tags_of_terms(getattr(state.env_states, "metrics", {})))
+        announced = (*reported, *episodes.tags_of_steps(getattr(state.env_states, "metrics", {})))
 
         def body(_: jax.Array, carry: tuple[TrainState, Metrics]) -> tuple[TrainState, Metrics]:
             state, metrics = update(env, config, carry[0], *given)

@@ -11,19 +11,10 @@ import jax
 import jax.numpy as jnp
 from jax.interpreters import partial_eval
 
-from bayessim_mjx.env.finite import NOT_FINITE
-from bayessim_mjx.physics.warp import OVERFLOW
 from bayessim_mjx.rollout.episodes import PolicyFn, select, traced
 
 if TYPE_CHECKING:
     from bayessim_mjx.env import Env, State
-
-TERM = "reward_"  # how metrics are called that are parts of the reward
-
-
-def kept(name: str) -> bool:
-    """Whether collection keeps the metric: parts of the reward, and what was not simulated or is no number."""
-    return name.startswith((TERM, NOT_FINITE)) or name == OVERFLOW
 
 
 def collect(
@@ -48,8 +39,8 @@ def collect(
 
     Returns:
         (the last states, time-major arrays [T, N, ...]): observation and final_observation (the next one, before any
-        reset) by group, reward, terminated, truncated, extras, and terms (metrics that are `kept`). What later steps do
-        not depend on is not carried on: it stays in the states as it was.
+        reset) by group, reward, terminated, truncated, extras, and metrics (those that are one number a world). What
+        later steps do not depend on is not carried on: it stays in the states as it was.
     """
     worlds = env_states.reward.shape[0]
     size, lasting = ring(worlds), _lasting(env, env_states, tuple(groups))
@@ -69,7 +60,7 @@ def collect(
             "terminated": terminated,
             "truncated": truncated,
             "extras": extras,
-            "terms": {name: x for name, x in getattr(after, "metrics", {}).items() if kept(name)},
+            "metrics": {name: x for name, x in getattr(after, "metrics", {}).items() if x.ndim == 1},
         }
         following = first + (index - first + stride) % size
         fresh = jax.tree.map(lambda lasts, new: new[index] if lasts else new, lasting, pool)

@@ -179,9 +179,11 @@ def test_parts_of_the_reward_are_logged_and_add_up():
 
     state = rl.init(Parts(), CONFIG, jax.random.PRNGKey(0))
     _, data = jax.jit(lambda s: worlds.gather(Learner(Parts(), CONFIG, ()), s, None, jax.random.PRNGKey(1)))(state)
-    np.testing.assert_allclose(sum(data["terms"].values()), data["reward"], rtol=1e-5)
+    parts = [data["metrics"]["reward_move"], data["metrics"]["reward_effort"]]
+    np.testing.assert_allclose(sum(parts), data["reward"], rtol=1e-5)
     _, metrics = ppo.make_update(Parts(), CONFIG)(state)
     assert {tag for tag in metrics if tag.startswith("Reward/")} == {"Reward/move", "Reward/effort"}
+    assert {tag for tag in metrics if tag.startswith("Metric/")} == {"Metric/speed"}
 
 
 def test_each_network_sees_the_groups_that_it_is_given():
