@@ -21,8 +21,8 @@ class Element(NamedTuple):
     target: str
 
 
-def of_actor(model: mujoco.MjModel, actor: str, actors: Sequence[str], where: str) -> list[int]:
-    """Bodies of an actor: the subtree of the body of that name, else the model without the other actors' subtrees.
+def of_actor(model: mujoco.MjModel, actor: str, others: Sequence[str], where: str) -> list[int]:
+    """Bodies of an actor: the subtree of the body of that name, else the model without the subtrees of `others`.
 
     The model goes by its name in the MJCF, or as `robot`.
     """
@@ -32,7 +32,7 @@ def of_actor(model: mujoco.MjModel, actor: str, actors: Sequence[str], where: st
     whole = [model.names[: model.names.index(b"\0")].decode(), WHOLE]
     if actor.rstrip("_") not in whole:
         raise UserError(f"{where}: no actor {actor!r}; {suggest(actor, [*whole, *have[1:]])}")
-    taken = {b for other in actors if other in have for b in attributes.subtree(model, have.index(other))}
+    taken = {b for other in others if other in have for b in attributes.subtree(model, have.index(other))}
     return [b for b in attributes.subtree(model, 0) if b not in taken]
 
 

@@ -8,7 +8,8 @@ makes effects of them, whose parameters follow the model's.
 
 import dataclasses
 import fnmatch
-from collections.abc import Iterator, Mapping, Sequence
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -54,10 +55,10 @@ def read(section: Mapping[str, Any], model: mujoco.MjModel) -> list[Parameter]:
     for actor, groups in actors.items():
         where = f"{PATH}.actor_params.{actor}"
         if actor == "option":
-            found += _group(model, [], "option", groups, where)
+            found += _group(model, lambda _: (), "option", groups, where)
         elif actor != "effects":
-            found += _actor(model, actor, groups, [a for a in actors if a not in ("effects", "option")], where)
-    found += _group(model, [], "option", section.get("option") or {}, f"{PATH}.option")
+            found += _actor(model, actor, {a: g for a, g in actors.items() if a not in ("effects", "option")}, where)
+    found += _group(model, lambda _: (), "option", section.get("option") or {}, f"{PATH}.option")
     return found
 
 
@@ -99,34 +100,50 @@ def _open(section: Any) -> tuple[Mapping[str, Any], dict[str, Mapping[str, Any]]
 
 
 def _actor(
-    model: mujoco.MjModel, actor: str, groups: Mapping[str, Any], actors: Sequence[str], where: str
+    model: mujoco.MjModel, actor: str, actors: Mapping[str, Mapping[str, Any]], where: str
 ) -> Iterator[Parameter]:
+    """Parameters of one actor; the whole model has those that no actor of its own states for its bodies."""
+    groups = actors[actor]
     checks.known(groups, (*GROUPS, *OTHER_GROUPS), where)
-    bodies = elements.of_actor(model, actor, actors, where)
+    elements.of_actor(model, actor, [], where)
     for group, content in groups.items():
         path = f"{where}.{group}"
         if group in ("color", "effects"):  # looks, not physics; not the model's
             continue
         if group == "scale":
-            yield _scale(model, actor, actors, checks.mapping(content, path), path)
+            yield _scale(model, actor, list(actors), checks.mapping(content, path), path)
         else:
+            bodies = functools.partial(_bodies, model, actor, actors, group)
             yield from _group(model, bodies, group, content or {}, path)
 
 
+def _bodies(
+    model: mujoco.MjModel, actor: str, actors: Mapping[str, Mapping[str, Any]], group: str, attribute: str
+) -> list[int]:
+    """Bodies of an actor without those of actors that state the attribute, or a scale, of their own."""
+    others = [o for o, groups in actors.items() if "scale" in groups or attribute in (groups.get(group) or {})]
+    return elements.of_actor(model, actor, others, f"{PATH}.actor_params.{actor}")
+
+
 def _group(
-    model: mujoco.MjModel, bodies: Sequence[int], group: str, content: Mapping[str, Any], where: str
+    model: mujoco.MjModel, bodies: Callable[[str], Sequence[int]], group: str, content: Mapping[str, Any], where: str
 ) -> Iterator[Parameter]:
-    """Parameters of one group, elements outside attributes, but for dofs attributes outside elements."""
+    """Parameters of one group, elements outside attributes, but for dofs attributes outside elements.
+
+    bodies: attribute -> those that may take it.
+    """
     kind, allowed = GROUPS[group]
     checks.known(content, allowed, where)
     content = {attribute: setting or {} for attribute, setting in content.items()}
-    available = elements.of_bodies(model, bodies, kind)
-    members = {a: _selected(model, available, kind, a, s, f"{where}.{a}") for a, s in content.items()}
+    own = {a: elements.of_bodies(model, bodies(a), kind) for a in content}
+    members = {a: _selected(model, own[a], kind, a, s, f"{where}.{a}") for a, s in content.items()}
     if kind == "joint":
         pairs = [(e, a) for a in content for e in members[a]]
     else:
         seen = list(dict.fromkeys(e for a in content for e in members[a]))
-        pairs = [(e, a) for e in sorted(seen, key=available.index) for a in content if e in members[a]]
+        every = [(e.kind, e.target) for e in elements.of_bodies(model, range(model.nbody), kind)]
+        seen.sort(key=lambda e: every.index((e.kind, e.target)))
+        pairs = [(e, a) for e in seen for a in content if e in members[a]]
     for e, a in pairs:
         yield _parameter(model, e, a, content[a], f"{where}.{a}")
 

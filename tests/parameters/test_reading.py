@@ -57,6 +57,17 @@ def test_actors_are_subtrees_and_further_shapes_are_numbered():
     assert names[0] == "block_scale_mult" and "block_mass_mult" not in names and "torso_mass_mult" in names
 
 
+def test_an_actor_takes_from_the_whole_model_the_property_that_it_states_and_no_other():
+    mass = {"mass": scaling(1, 2)}
+    two = {
+        "block": {"rigid_body_properties": mass},
+        "walker": {"rigid_body_properties": mass, "rigid_shape_properties": {"friction": scaling(0.5, 2)}},
+    }
+    names = read(WALKER, {"actor_params": two}).names
+    assert names.count("block_mass_mult") == 1 and "torso_mass_mult" in names
+    assert {"block_friction_mult", "torso_friction_mult"} <= {*names}
+
+
 def test_marks_of_pictures_have_no_mass():
     marked = PENDULUM.replace(
         "</worldbody>",
