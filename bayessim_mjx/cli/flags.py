@@ -3,12 +3,13 @@
 import argparse
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from bayessim_mjx import trust
 from bayessim_mjx.cli import ancestors, commands
 from bayessim_mjx.cli.parsers import PlainParser, integer, task
+from bayessim_mjx.config import listing
 from bayessim_mjx.config.layers import SECTIONS
 from bayessim_mjx.config.settings import WRITERS, Config
 from bayessim_mjx.errors import UserError
@@ -152,7 +153,7 @@ class Parser(PlainParser):
                 names = [ours, *(flag for flag, same in ancestors.SAME.items() if same == ours)]
                 setattr(args, ours[2:], ancestors.one_value({name: getattr(args, name[2:]) for name in names}))
         args.overrides = rest
-        args.idle = [key for key in (text.split("=")[0] for text in rest) if self._has_no_use_for(key)]
+        args.idle = [key for key in (text.split("=")[0] for text in rest) if self._idle(key)]
         args.command = self.command
         given = [a.split("=")[0] for a in argv if a.startswith("--")]
         args.given = [ancestors.SAME.get(flag, flag) for flag in given]
@@ -177,6 +178,14 @@ class Parser(PlainParser):
             raise self.refusal(UserError(f"{text!r} is neither a flag nor an override section.key=value"))
         self._refuse_flag_as_key(text)
 
+    def unknown_flag(self, flag: str, known: Iterable[str]) -> UserError:
+        """Return the error for a flag that does not exist, with the settings of that name, else with close flags."""
+        name = flag.strip("-").replace("-", "_").rpartition(".")[2]
+        same = [f"{key}=VALUE" for key in listing.paths() if key.rpartition(".")[2] == name and not self._idle(key)]
+        if not same:
+            return super().unknown_flag(flag, known)
+        return UserError(f"flag {flag!r} is unknown. Did you mean the setting {' or '.join(same)}, without dashes?")
+
     def _refuse_flag_as_key(self, text: str) -> None:
         """UserError for a flag in Hydra's form, as IsaacGymEnvs has it: task=Ant, headless=True, test=True."""
         key, _, value = text.partition("=")
@@ -189,5 +198,5 @@ class Parser(PlainParser):
         if said is not None and not value.startswith("{"):
             raise UserError(f"override {text!r}: {said}")
 
-    def _has_no_use_for(self, key: str) -> bool:
+    def _idle(self, key: str) -> bool:
         return key.split(".")[0] in self.unused and key not in self.but

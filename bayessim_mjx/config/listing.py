@@ -30,12 +30,24 @@ def text(section: str | None = None) -> str:
     return "\n\n".join(_of(name, kind) for name, kind in known.items() if section in (None, name))
 
 
+def paths() -> list[str]:
+    """List the settings with their sections, as overrides spell them: `ppo.gamma`."""
+    return [_key(kind, own) for kind in sections().values() for own in _stated(kind)]
+
+
+def _stated(kind: type[settings.Section]) -> list[Any]:
+    """Fields of a section, but a section of its own, which has its own part."""
+    return [own for own in dataclasses.fields(kind) if "doc" in own.metadata]  # type: ignore[arg-type]
+
+
+def _key(kind: type[settings.Section], own: Any) -> str:
+    return f"{kind.SECTION}.{settings.YAML_NAMES.get(own.name, own.name)}".lstrip(".")
+
+
 def _of(name: str, kind: type[settings.Section]) -> str:
     lines = [f"{name}:" if name != TOP else f"{name}, without a section:"]
-    for own in dataclasses.fields(kind):  # type: ignore[arg-type]
-        if "doc" not in own.metadata:  # a section of its own, which has its own part
-            continue
-        key = f"{kind.SECTION}.{settings.YAML_NAMES.get(own.name, own.name)}".lstrip(".")
+    for own in _stated(kind):
+        key = _key(kind, own)
         default = own.default if own.default_factory is dataclasses.MISSING else own.default_factory()
         lines.append(f"  {key} = {_written(default)}")
         lines += textwrap.wrap(own.metadata["doc"], WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6)

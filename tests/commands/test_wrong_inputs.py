@@ -62,6 +62,7 @@ WRONG = {
     f"{DIAGNOSE} --seed 1.5": "--seed: invalid int value: '1.5'; allowed: a whole number",
     f"{DIAGNOSE} --minutes -3": "--minutes: '-3': allowed: minutes, more than 0",
     "main --seed 1": "no task: give --task NAME (--list_tasks shows the names)",
+    "train --task Pendulum --gamma 0.9": "Did you mean the setting ppo.gamma=VALUE, without dashes?",
     "main --task Pendlum": "--task 'Pendlum' is unknown. Did you mean Pendulum",
     "main --task Pendulum bayessim.component=5": "Allowed: those that `bayessim-mjx help settings bayessim` prints",
     "main --task Pendulum --cfg_env slip.yaml": "slip.yaml: key 'bayessim.component' is unknown",
