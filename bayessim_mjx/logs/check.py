@@ -55,6 +55,9 @@ def check_names(table: Table, columns: Mapping[str, Array], channels: Channels) 
             raise UserError(f"{table.path}: unknown column {column!r}; did you mean {right!r}?")
     missing = [c for c in needed_columns(columns, channels) if c not in columns]
     if missing:
+        if unmapped := [c for c in missing if c in table.columns]:
+            way = "name each channel, also one whose column is called like it"
+            raise UserError(f"{table.path}: the map leaves out {', '.join(unmapped)}, which the file has; {way}")
         names = ", ".join(table.columns)
         constant = "a joint that was not recorded can be held constant in the map (qpos: {<joint>: {value: 0.0}})"
         way = "`bayessim-mjx logs check DIR --model FILE` proposes a map of columns with other names"

@@ -56,6 +56,8 @@ def check_units(
         if source.value is None and stream in ("ctrl", "qpos", "qvel"):
             _kind(log_map, name, source, kinds.get(own, ""))
             _by_name(table, log_map, name, source, followed, channels)
+        if stream == "ctrl" and through[channels.actuators.index(own)]:
+            _of_motor(log_map, name, source, model, channels.actuators.index(own))
     unstated = {name for name in columns if name not in sources or not sources[name].stated}
     for j, joint in enumerate(channels.joints):
         kind, name = channels.kinds[j], f"qpos:{joint}"
@@ -85,6 +87,20 @@ def _kind(log_map: LogMap, name: str, source: Source, kind: str) -> None:
         key = name.replace(":", ".")
         allowed = "an angle's unit" if kind == "hinge" else "m, mm, cm or percent, or `scale` in m"
         raise UserError(f"{log_map.path}: {key}.unit = {source.unit!r} of a {kind} joint; allowed: {allowed}")
+
+
+def _of_motor(log_map: LogMap, name: str, source: Source, model: mujoco.MjModel, i: int) -> None:
+    """Refuse places and speeds as commands of a motor: it takes an effort, so they are targets of a controller."""
+    fixed = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+    motor = fixed and int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_NONE)
+    place, speed = source.unit in {**units.ANGLES, **units.LENGTHS}, source.unit in {**units.TURNING, **units.MOVING}
+    if motor and (place or speed):
+        own, law = name.partition(":")[2], "velocity, kp: KP" if speed else "position, kp: KP, kd: KD"
+        raise UserError(
+            f"{log_map.path}: ctrl.{own}.unit = {source.unit!r}: the model's {own} is a motor, whose command is an "
+            f"effort; for targets state the controller that follows them: `metadata: {{controller: {{law: {law}}}}}`, "
+            f"or make {own} a {'velocity' if speed else 'position'} actuator in the model"
+        )
 
 
 def _by_name(
