@@ -51,14 +51,19 @@ class Weighed:
         """Of the sets that are as likely as the most likely one (`Odds.mention`), that with the fewest numbers.
 
         No effects that leave a relevant gap which others of them close: their evidence may rest on one of `doubts`,
-        such as a late sensor, that no simulator gets. No effect without which only known parameters move: the logs do
-        not separate it from a wrong data sheet, however probable it is.
+        such as a late sensor, that no simulator gets. No effect without which only known parameters move, unless the
+        logs alone and the data sheet alone both speak for it: else it is not separated from a wrong data sheet.
         """
         likely, top = self._within(ODDS.mention), next(iter(self.weight))
         limit = min(self.left[k].excess for k in likely) + _relevant(self.left)
         closing = [k for k in likely if not k or self.left[k].excess <= limit]
-        closing += [k for k in self.weight if k < top and self.left[k].excess <= limit]
+        closing += [k for k in self.weight if k < top and self.left[k].excess <= limit and not self._separate(top, k)]
         return min(closing, key=lambda k: (len(k), self.numbers[k], -self.weight[k], sorted(k)))
+
+    def _separate(self, whole: Key, part: Key) -> bool:
+        """Whether the logs alone and the data sheet alone both speak strongly for what a set has more than its part."""
+        sheet = self.left[part].unlikely - self.left[whole].unlikely
+        return bool(min(sheet, self.nats[whole] - self.nats[part] - sheet) > np.log(ODDS.strong))
 
     @property
     def beside(self) -> list[Key]:

@@ -92,6 +92,18 @@ def test_an_effect_that_does_the_work_of_known_parameters_is_weighed_by_the_data
     assert near.answer == NONE and near.weight == {NONE: 1.0}
 
 
+@pytest.mark.parametrize(
+    ("more", "unlikely", "named"),
+    [(40.0, 9.0, AB), (40.0, 2.0, A), (11.0, 9.0, A), (13.0, 9.0, AB)],
+    ids=["both", "the logs alone", "the data sheet alone", "both, just"],
+)
+def test_an_effect_for_which_logs_and_data_sheet_both_speak_is_named(more, unlikely, named):
+    """A payload beside a delay that makes nearly the whole gap: without it a mass is twice the data sheet's."""
+    evidence = {NONE: 0.0, A: 500.0, AB: 500.0 + more - log_prior(AB, 30) + log_prior(A, 30)}
+    found = weighed(evidence, {NONE: 100.0, A: 0.2, AB: 0.0}, unlikely={NONE: 9.0, A: unlikely})
+    assert found.answer == named and found.weight[AB] > 0.99
+
+
 def test_named_effects_are_as_probable_as_all_sets_with_them():
     """Beside an effect that closes the gap, another may do the work of known parameters: no rival of the first."""
     evidence = {NONE: 0.0, A: 50.0, AB: 51.0 - log_prior(B, 30), B: 3.0}
