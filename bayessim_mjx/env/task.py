@@ -22,6 +22,7 @@ from bayessim_mjx.errors import UserError
 from bayessim_mjx.mirrors import Mirror, resolve
 from bayessim_mjx.parameters import Parameter, ParameterSpace
 from bayessim_mjx.parameters.checks import with_zeros
+from bayessim_mjx.parameters.reading import read
 from bayessim_mjx.physics import Physics, World, control_step, mjx
 from bayessim_mjx.physics.implementation import Choice, choose
 from bayessim_mjx.physics.nuisance import GRAVITY, Course, Drawn
@@ -79,9 +80,12 @@ class Task(Env):
         randomization = randomization or {}
         if "randomization_params" not in randomization:  # --randomize says only that there is some
             randomization = {**getattr(self, "randomization", {}), **randomization}
-        section = {} if randomization.get("randomize") is False else randomization.get("randomization_params", {})
-        section = with_zeros(section, self.zeros)
+        given = with_zeros(randomization.get("randomization_params") or {}, self.zeros)
+        off = randomization.get("randomize") is False
+        section = {} if off else given
         spec, mj_model, space = corrected(self.spec(), section, calibrated)
+        if off:  # a slip is refused now, not when it is switched on
+            read(given, mj_model)
         if calibrated:
             self.spec = spec.copy  # type: ignore[method-assign]  # of the corrected model
         impl, worlds = self.settings["impl"], (config or {}).get("numEnvs")

@@ -31,7 +31,7 @@ def of_actor(model: mujoco.MjModel, actor: str, others: Sequence[str], where: st
         return attributes.subtree(model, have.index(actor))
     whole = [model.names[: model.names.index(b"\0")].decode(), WHOLE]
     if actor.rstrip("_") not in whole:
-        raise UserError(f"{where}: no actor {actor!r}; {suggest(actor, [*whole, *have[1:]])}")
+        raise UserError(f"{where}: no actor {actor!r}; {suggest(actor, list(dict.fromkeys([*whole, *have[1:]])))}")
     taken = {b for other in others if other in have for b in attributes.subtree(model, have.index(other))}
     return [b for b in attributes.subtree(model, 0) if b not in taken]
 

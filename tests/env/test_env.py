@@ -76,6 +76,12 @@ def test_a_world_is_held_in_its_last_sound_state():
     assert not all(np.array_equal(a, b) for a, b in zip(new, old, strict=True))
 
 
+def test_parameters_that_are_switched_off_are_read_all_the_same():
+    wrong = {"actor_params": {"cat": {"rigid_body_properties": {"mass": {"range": [0.5, 2.0]}}}}}
+    with pytest.raises(UserError, match="no actor 'cat'.*cart"):
+        type(registry.make("Cartpole"))({}, {"randomize": False, "randomization_params": wrong})
+
+
 def test_without_randomisation_the_space_is_empty_and_the_domain_none():
     env = registry.make("Cartpole", config=config.load("Cartpole", overrides=["task.randomize=False"]))
     assert len(env.space) == 0 and domain_or_prior(env.space, 3) is None
