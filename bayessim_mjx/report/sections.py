@@ -229,12 +229,12 @@ def _effect(e: FoundEffect) -> dict[str, Any]:
 
 def candidates(d: Diagnosis) -> dict[str, Any]:
     """Return the best of the ranking, scores with one and two standard errors on a scale that all rows share."""
-    shown = d.candidates[:MOST_CANDIDATES]
-    reach = [c["score"] + k * (c.get("se") or 0.0) for c in shown if finite(c.get("score")) for k in (-2, 2)]
-    limits = marks.scale_of(reach, zero=True)
     rows, answer = [], d.rank
+    shown = {k: c for k, c in enumerate(d.candidates, 1) if k <= MOST_CANDIDATES or k == answer}
+    reach = [c["score"] + k * (c.get("se") or 0.0) for c in shown.values() if finite(c.get("score")) for k in (-2, 2)]
+    limits = marks.scale_of(reach, zero=True)
     hinged = all(row.get("unit") == "rad" for row in d.gap.physical.values())
-    for k, c in enumerate(shown, 1):
+    for k, c in shown.items():
         score, se = c.get("score"), c.get("se") or 0.0
         spans = [(score - m * se, score + m * se) for m in (2, 1)] if finite(score) and finite(se) else [None, None]
         colour = EFFECTS if k == answer else "#5b6670"
@@ -255,7 +255,7 @@ def candidates(d: Diagnosis) -> dict[str, Any]:
     return {
         "rows": rows,
         "more": len(d.candidates) - len(shown),
-        "absorbed": any(finite(c.get("absorbed")) for c in shown),
+        "absorbed": any(finite(c.get("absorbed")) for c in shown.values()),
     }
 
 

@@ -68,6 +68,7 @@ WITHIN = "Every joint is within its tolerance. The closest is {within}."
 PROBABLE = (
     "Probability among all fitted explanations: {own} for this one, {others}, {nothing} for the known parameters alone."
 )
+WITH_MORE = " Of it {more} is for sets with {effects}, whose work known parameters do here."
 BEHIND = (
     "The held-out score alone ranks it {rank} of {count}, {behind} nats behind the first{error}. The verdict goes by "
     "the probability."
@@ -263,7 +264,19 @@ def _probable(d: Diagnosis) -> str:
     own, others, nothing = (percent(chance[k]) for k in ("answer", "rivals", "nothing"))
     nothing = nothing if nothing.strip("0. %") else "less than one in a million"  # by the digits of `percent`
     others = f"{others} for its rivals together" if chance["rivals"] else "which has no rival"
-    return PROBABLE.format(own=own, others=others, nothing=nothing)
+    return PROBABLE.format(own=own, others=others, nothing=nothing) + _with_more(d)
+
+
+def _with_more(d: Diagnosis) -> str:
+    """Say where sets with further effects have most of the probability of the named effects."""
+    own = {f"{e.name}@{e.where}" for e in d.effects}
+    larger = {frozenset(s["effects"]) - own: s["probability"] for s in d.evidence if own < {*s["effects"]}}
+    whole = sum(larger.values())
+    if not larger or 2 * whole <= d.basis["probability"]["answer"]:
+        return ""
+    likeliest = max(larger.items(), key=lambda item: item[1])[0]
+    more = [label.split("@") for label in sorted(likeliest)]
+    return WITH_MORE.format(more=percent(whole), effects=named.all_of(more))
 
 
 def _behind(d: Diagnosis) -> str:

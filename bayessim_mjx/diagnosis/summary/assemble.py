@@ -13,6 +13,7 @@ from bayessim_mjx import versions
 from bayessim_mjx.diagnosis import statistics
 from bayessim_mjx.diagnosis.experiment.propose import Experiment
 from bayessim_mjx.diagnosis.findings import Findings, Where
+from bayessim_mjx.diagnosis.fitting.candidates import Candidate
 from bayessim_mjx.diagnosis.phrases import effects as phrases
 from bayessim_mjx.diagnosis.phrases import notes, residual
 from bayessim_mjx.diagnosis.phrases.verdict import sentences
@@ -71,7 +72,7 @@ def diagnosis_of(found: Findings, about: Mapping[str, Any] | None = None, file: 
         where=residual.places(where.found) if where and where.found.spots else _where(found),
         gap=far,
         parameters=estimates.parameters(selection, model, sd, known),
-        candidates=ranking(selection.state),
+        candidates=ranking(selection.state, selection.answer.effects),
         warnings=[*warned, *estimates.less_accurate(model, own.sheet), *found.warnings],
         next_experiment=experiment,
         versions=versions.of(PACKAGES),
@@ -122,12 +123,15 @@ def _told(found: Findings, covariance: np.ndarray) -> np.ndarray:
     return bounds.spread_out(covariance, model.fit.away, at)
 
 
-def ranking(state: SearchState) -> list[dict[str, Any]]:
-    """Models tried, best first: held-out score, nats over the known parameters alone, and its standard error."""
+def ranking(state: SearchState, answer: Sequence[Candidate] = ()) -> list[dict[str, Any]]:
+    """Return the best models, with all before the answer: held-out score, nats over the known parameters, its error."""
     rows = statistics.leave_one_out(state.fitter.simulator.windows.condition)
     absorbed = {s.candidate.label: s.absorbed for s in state.screened}
     out: list[dict[str, Any]] = []
-    rows_of = ranked(state)[:60]
+    every = ranked(state)
+    named = {e.label for e in answer}
+    at = next((k for k, model in enumerate(every, 1) if named and {e.label for e in model.effects} == named), 0)
+    rows_of = every[: max(60, at)]
     samples = rows_of[0].samples  # one for all, so that scores are in the order of the errors
     for model in rows_of:
         ratio = np.log((rows @ state.base.cost) / (rows @ model.cost))

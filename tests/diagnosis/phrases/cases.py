@@ -30,6 +30,8 @@ RANKED = [
 ]
 FURTHER = [RANKED[0] | {"effects": ["coulomb_friction@hinge", "gain@torque"], "gap_closed": 0.9815},
            RANKED[1] | {"gap_closed": 0.98}, RANKED[2]]  # fmt: skip
+LARGER = [{"effects": ["coulomb_friction@hinge", "payload@arm"], "probability": 0.88, "nats": 900.0},
+          {"effects": ["coulomb_friction@hinge"], "probability": 0.02, "nats": 880.0}]  # fmt: skip
 FAST = '<mujoco><option integrator="implicitfast"/></mujoco>'
 STEP = {"timestep": 0.005, "substep": 0.005, "integrator": "RK4", "delivered": "implicitfast"}
 COARSE = dataclasses.replace(NO_EFFECTS, nominal=6.1, calibrated=0.93, with_effects=0.93)
@@ -135,6 +137,7 @@ def every():
         "noise, white": made("noise", noise_memory=0.0),
         "noise with a memory": made("noise", noise_memory=0.06),
         "one effect": made("effects", [FRICTION], probability=chance),
+        "with another effect more probable": made("effects", [FRICTION], probability=chance, evidence=LARGER),
         "another set with the best score": made("effects", [FRICTION], probability=chance, candidates=RANKED),
         "a larger set with the best score": made("effects", [FRICTION], probability=chance, candidates=FURTHER),
         "two effects": made("effects", [FRICTION, GAIN], hidden=["viscous_friction@hinge"]),

@@ -38,6 +38,7 @@ def contradictions(said: Said) -> list[tuple[str, str]]:
         _places,
         _hidden,
         _ranked,
+        _larger,
         _ways,
     )
     return [found for rule in rules for found in rule(said)]
@@ -117,6 +118,7 @@ def _quoted(said: Said) -> Iterator[tuple[str, str]]:
         r"that force makes": [basis.get("remains")],
         "among all fitted explanations:": [chance.get("answer")],
         "for this one,": [chance.get("rivals")],
+        "Of it": [_with_more(said)],
         "of a wrong data sheet is": [chance.get("nothing")],
         r"force removes": held,
         r"The effects close": [max(sheet["coasting"], 0.0)],
@@ -126,11 +128,17 @@ def _quoted(said: Said) -> Iterator[tuple[str, str]]:
         if not any(v is not None and rounds_to(100 * v, of) for v in values):
             yield "share", f"'{before} {of} %', in the data {[round(v, 4) for v in values if v is not None]}"
     known = [*numbers(said), *(1 - v for v in numbers(gap)), *sheet.values(), 1 - sheet["effects"], 0.9, 0.1]
-    known += [RELEVANT, *_further(said)]
+    known += [RELEVANT, *_further(said), _with_more(said)]
     known += [a / b for r in gap["physical"].values() for a in numbers(r) for b in [r.get("motion") or 0.0] if b]
     for of in re.findall(rf"({NUMBER}) ?%", text_of(said)):
         if not any(rounds_to(100 * v, of) for v in known):
             yield "source", f"{of} % is no number of the result"
+
+
+def _with_more(said: Said) -> float:
+    """Probability of the sets with the named effects and others."""
+    named = {f"{e['name']}@{e['where']}" for e in said["effects"]}
+    return float(sum(s["probability"] for s in said.get("evidence") or [] if named < {*s["effects"]}))
 
 
 def _further(said: Said) -> list[float]:
@@ -262,6 +270,14 @@ def _ranked(said: Said) -> Iterator[tuple[str, str]]:
         yield "rank", f"{alike[1]} sets are said to be ahead with an irrelevant share, {_further(said)} in the table"
     if behind >= CLEARLY and "Probability among" in text_of(said) and not (quoted or alike):
         yield "rank", f"the most probable set is number {ranks[0]} of the table, and no sentence says so"
+
+
+def _larger(said: Said) -> Iterator[tuple[str, str]]:
+    """Sets with further effects that have most of the probability, beside a sentence that gives it to the named."""
+    whole = _with_more(said)
+    own = ((said.get("basis") or {}).get("probability") or {}).get("answer", math.inf)
+    if 2 * whole > 1.02 * own and "for this one," in text_of(said) and "Of it" not in text_of(said):
+        yield "larger", f"{whole:.3g} of the probability is that of larger sets"
 
 
 def _ways(said: Said) -> Iterator[tuple[str, str]]:

@@ -86,6 +86,13 @@ def test_a_verdict_behind_others_that_is_called_without_a_rival_is_found():
     assert "rank" in {found for found, _ in contradictions(planted)}
 
 
+def test_a_larger_set_with_most_of_the_probability_is_missed():
+    planted = said("with another effect more probable")
+    assert any("Of it 88 % is for sets with extra payload at arm" in text for text in planted["sentences"])
+    planted["sentences"] = [text.partition(" Of it ")[0] for text in planted["sentences"]]
+    assert "larger" in {found for found, _ in contradictions(planted)}
+
+
 def test_a_late_effort_beside_a_late_measurement_is_found():
     planted = said("one effect")
     planted["effects"][0]["name"] = "sensor_delay"
