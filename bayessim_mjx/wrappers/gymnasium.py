@@ -102,6 +102,17 @@ def _options(options: Mapping[str, Any] | None, allowed: tuple[str, ...]) -> dic
     return given
 
 
+def _acted(action: Any, space: gymnasium.Space) -> jax.Array:
+    """Return the action as an array.
+
+    Raises:
+        UserError: it has not the shape of the action space.
+    """
+    if np.shape(action) != space.shape:
+        raise UserError(f"step: an action of shape {np.shape(action)}; allowed: {space.shape}, that of action_space")
+    return jnp.asarray(action, jnp.float32)
+
+
 class GymnasiumEnv(gymnasium.Env):
     """One world; observations are the group "policy". `reset(options={"theta": [d]})` sets theta from then on.
 
@@ -140,7 +151,7 @@ class GymnasiumEnv(gymnasium.Env):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         if self._state is None:
             raise UserError("step before reset: call reset() first")
-        self._state = self._step(self._state, jnp.asarray(action, jnp.float32))
+        self._state = self._step(self._state, _acted(action, self.action_space))
         info = self._state.info
         metrics = {name: float(value) for name, value in self._state.metrics.items()}
         observation = np.array(self._state.obs["policy"])
@@ -262,7 +273,7 @@ class GymnasiumVectorEnv(VectorEnv):
         if self.mode is DISABLED and self._ended.any():
             raise UserError(f"worlds {np.flatnonzero(self._ended).tolist()} have ended: reset them with a reset_mask")
         self._key, key = jax.random.split(self._key)
-        old, acted = (self._state, self._thetas), jnp.asarray(actions, jnp.float32)
+        old, acted = (self._state, self._thetas), _acted(actions, self.action_space)
         after, (self._state, self._thetas) = self._step(key, old, self._ended, acted, self._domain, self._given)
         terminated, truncated = (np.asarray(after.info[name]) > 0 for name in ("terminated", "truncated"))
         refuse_overflow(np.mean(after.metrics.get(OVERFLOW, 0.0)), "the worlds in this step")

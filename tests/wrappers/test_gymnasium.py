@@ -161,6 +161,14 @@ def test_parameters_that_cannot_be_meant_are_refused():
         GymnasiumVectorEnv(env, 0)
 
 
+def test_an_action_of_another_shape_is_refused_with_the_right_one():
+    env = make("Pendulum")
+    for worlds, shape in ((GymnasiumEnv(env), r"\(1,\)"), (GymnasiumVectorEnv(env, 2), r"\(2, 1\)")):
+        worlds.reset(seed=0)
+        with pytest.raises(UserError, match=rf"an action of shape \(3,\); allowed: {shape}"):
+            worlds.step(np.zeros(3))
+
+
 def test_ended_worlds_restart_and_keep_their_last_observation():
     domain = probes.Domain(jnp.array([2.0]), jnp.array([3.0]))
     env = GymnasiumVectorEnv(probes.Clock(), 3, domain, "SameStep")
