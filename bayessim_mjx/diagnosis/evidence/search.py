@@ -98,7 +98,7 @@ class Search:
             rest = best - {effect.label}
             if rest not in self.state.models:
                 continue
-            for c in self.state.candidates:
+            for c in (c for c in self.state.candidates if c.label not in best):
                 columns, key = self.state.secants.of([c]), rest | {c.label}
                 again = inertia(c, effect) or same_lateness(c, effect, self.state.fitter.simulator.physics.mj_model)
                 alike = again or related(c, effect)

@@ -49,6 +49,25 @@ def test_plans_around_a_set_are_made_anew_where_its_fit_has_gained(monkeypatch):
     assert own._around(key) == [2] and made == [10.0, 188.0]
 
 
+def test_no_plan_puts_a_law_in_that_the_set_has(monkeypatch):
+    """A payload and the inertia of its body may stand for each other, but not where both are in the set."""
+    every = [law(effect, "body", "arm") for effect in ("payload", "inertial_parameters", "coulomb_friction")]
+    for one in every:
+        one.label = one.effect
+    monkeypatch.setattr(search, "inertia", lambda c, effect: "coulomb_friction" not in (c.label, effect.label))
+    monkeypatch.setattr(search, "related", lambda c, effect: False)
+    monkeypatch.setattr(search, "same_lateness", lambda c, effect, model: False)
+    own = search.Search.__new__(search.Search)
+    own._again, own._begun = set(), lambda model, effect, c: ((), ())
+    fitter = SimpleNamespace(simulator=SimpleNamespace(physics=SimpleNamespace(mj_model=None)))
+    for effects in (every[:1], every[:2]):
+        key = frozenset(e.label for e in effects)
+        models = {k: SimpleNamespace(effects=effects) for k in (key, *(key - {x} for x in key))}
+        secants = SimpleNamespace(of=lambda some: list(some))
+        own.state = SimpleNamespace(models=models, candidates=every, secants=secants, fitter=fitter)
+        assert [p.columns[0].label for p in own._related(key)] == ["inertial_parameters"] * (len(effects) == 1)
+
+
 @pytest.mark.parametrize("far", [0.05, 0.2, 0.4])
 def test_intervals_hold_90_percent_of_the_mixture_over_sets(far):
     share, away = np.array([1 - far, far]), np.array([[0.0, 0.0], [-0.8, 0.0]])
