@@ -68,7 +68,7 @@ WITHIN = "Every joint is within its tolerance. The closest is {within}."
 PROBABLE = (
     "Probability among all fitted explanations: {own} for this one, {others}, {nothing} for the known parameters alone."
 )
-WITH_MORE = " Of it {more} is for sets with {effects}, whose work known parameters do here."
+WITH_MORE = " Sets with {effects} as well have {more} of it. In the named set, known parameters replace that."
 BEHIND = (
     "The held-out score alone ranks it {rank} of {count}, {behind} nats behind the first{error}. The verdict goes by "
     "the probability."

@@ -118,7 +118,7 @@ def _quoted(said: Said) -> Iterator[tuple[str, str]]:
         r"that force makes": [basis.get("remains")],
         "among all fitted explanations:": [chance.get("answer")],
         "for this one,": [chance.get("rivals")],
-        "Of it": [_with_more(said)],
+        "as well have": [_with_more(said)],
         "of a wrong data sheet is": [chance.get("nothing")],
         r"force removes": held,
         r"The effects close": [max(sheet["coasting"], 0.0)],
@@ -276,7 +276,7 @@ def _larger(said: Said) -> Iterator[tuple[str, str]]:
     """Sets with further effects that have most of the probability, beside a sentence that gives it to the named."""
     whole = _with_more(said)
     own = ((said.get("basis") or {}).get("probability") or {}).get("answer", math.inf)
-    if 2 * whole > 1.02 * own and "for this one," in text_of(said) and "Of it" not in text_of(said):
+    if 2 * whole > 1.02 * own and "for this one," in text_of(said) and "as well have" not in text_of(said):
         yield "larger", f"{whole:.3g} of the probability is that of larger sets"
 
 

@@ -88,8 +88,8 @@ def test_a_verdict_behind_others_that_is_called_without_a_rival_is_found():
 
 def test_a_larger_set_with_most_of_the_probability_is_missed():
     planted = said("with another effect more probable")
-    assert any("Of it 88 % is for sets with extra payload at arm" in text for text in planted["sentences"])
-    planted["sentences"] = [text.partition(" Of it ")[0] for text in planted["sentences"]]
+    assert any("Sets with extra payload at arm as well have 88 % of it." in text for text in planted["sentences"])
+    planted["sentences"] = [text.partition(" Sets with ")[0] for text in planted["sentences"]]
     assert "larger" in {found for found, _ in contradictions(planted)}
 
 
