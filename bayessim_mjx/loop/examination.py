@@ -124,7 +124,7 @@ def keep_or_replace(round_: Round, answer: Answer) -> tuple[Answer, Evidence]:
     if last is not None and gain < before and not _moved(last, answer.posterior):
         gained = f"{fixed(gain, 1)} nats" if np.isfinite(gain) else "nothing"
         warning = (
-            f"this round's posterior gains {gained} on simulated trajectories, that of the last round "
+            f"the network's posterior of this round gains {gained} on simulated trajectories, that of the last round "
             f"{fixed(before, 1)} nats: the last one stands"
         )
         stands = dataclasses.replace(answer, posterior=last, source="last round")

@@ -236,7 +236,7 @@ def _sets(axes: Any, sets: Any) -> None:
         shares = [c.coverage(level) for c in sets.counts]
         axes.plot(counts, shares, color=colour, marker="o", lw=1.8, label=f"{percent(level)} region", clip_on=False)
     for c in sets.counts:
-        axes.text(c.trajectories, 1.04, f"{c.gain:.1f}", ha="center", fontsize=8)
+        axes.text(c.trajectories, 1.04, fixed(c.gain, 1), ha="center", fontsize=8)
     axes.set_xscale("log", base=2)
     axes.set_xticks(counts, [str(n) for n in counts])
     axes.minorticks_off()
