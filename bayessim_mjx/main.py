@@ -213,7 +213,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     first = argv[0] if argv else "--help"
     if first in ("-h", "--help"):
-        return cli.command(_help)([])
+        return cli.command(_help)([word for word in argv[1:2] if commands.name_of(word) in commands.COMMANDS])
     adapts = first.startswith("-") or "=" in first
     return cli.command(_adapt if adapts else _named)(argv)
 

@@ -39,6 +39,8 @@ def console(
         for warning in diagnosis.warnings:
             out.warning(signs(warning))
         _tables(out, diagnosis, (_effects, _parameters))
+        if diagnosis.effects and (diagnosis.details.get("before_simulation") or {}).get("lines"):
+            out.say("these numbers replace the first guesses")
         for sentence in parted(diagnosis)[0]:
             out.say(f"- {signs(sentence)}")
         _tables(out, diagnosis, (_places,))

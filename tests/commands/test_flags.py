@@ -106,6 +106,7 @@ def test_the_list_of_commands_has_groups_and_a_line_for_each(capsys: pytest.Capt
     text = shown(capsys, "--help")
     assert text.startswith("usage: bayessim-mjx COMMAND [options]\n")
     assert shown(capsys) == shown(capsys, "help") == shown(capsys, "-h") == text
+    assert shown(capsys, "-h", "play") == shown(capsys, "help", "play") != text
     lines = text.splitlines()
     for name, command in cli.COMMANDS.items():
         heading = lines.index(f"{command.group}:")

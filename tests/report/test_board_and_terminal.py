@@ -107,11 +107,13 @@ def test_the_terminal_has_the_order_of_the_page(tmp_path):
     """Verdict, effects in one sentence, three gaps, a command, warnings; then the rest."""
     file = io.StringIO()
     about = {"model": "Pendulum", "data": ["logs"]}
-    report.console(dataclasses.replace(fake.full(), about=about), tmp_path, file=file)
+    details = fake.full().details | {"before_simulation": {"lines": ["first guess: Coulomb friction at elbow"]}}
+    report.console(dataclasses.replace(fake.full(), about=about, details=details), tmp_path, file=file)
     text = " ".join(file.getvalue().replace("│", " ").split())
     gaps = "Gap: 1.8 % of the motion (21.4 noise sd) as delivered, 1.1 % of the motion (13.1 noise sd) recalibrated"
     order = ["Missing effects found", "The simulator lacks", gaps, "bayessim-mjx train --task Pendulum", "warning:"]
-    at = [text.index(words) for words in [*order, "parameters", "- Recalibrating", "candidates"]]
+    rest = ["parameters", "these numbers replace the first guesses", "- Recalibrating", "candidates"]
+    at = [text.index(words) for words in [*order, *rest]]
     assert at == sorted(at)
 
 
