@@ -69,6 +69,8 @@ def check_units(
             _by_counting(table, name, columns[name], kind, of)
     for i, j in followed.items():
         pair = f"qpos:{channels.joints[j]}", f"ctrl:{channels.actuators[i]}"
+        if _held_by_its_range(model, i, j, channels):
+            continue
         if unstated & set(pair):
             _by_target(table, *pair, columns, of)
 
@@ -187,6 +189,19 @@ def _fitting(x: Array, kind: str, low: float, high: float) -> list[str]:
     if _whole(x) and kind == "hinge" and np.abs(x).max() > 200.0:
         found.append(units.COUNTS)
     return found
+
+
+def _held_by_its_range(model: mujoco.MjModel, i: int, j: int, channels: Channels) -> bool:
+    """Warn of a hinge whose range beside its servo's commands is nearer to rad read as degrees than to their equal."""
+    gear = abs(float(model.actuator_gear[i, 0])) or 1.0
+    (low, high), (least, most) = model.jnt_range[j], model.actuator_ctrlrange[i] / gear
+    limited = model.jnt_limited[j] and model.actuator_ctrllimited[i] and channels.kinds[j] == "hinge"
+    if not limited or high - low > np.sqrt(DEGREE) * (most - least):
+        return False
+    text = f"the model lets {channels.joints[j]} turn from {low:.3g} to {high:.3g} rad, and commands of "
+    text += f"{channels.actuators[i]} reach from {least:.3g} to {most:.3g} rad"
+    warnings.warn(f'{text}; angles in an MJCF are degrees unless it has `<compiler angle="radian"/>`', stacklevel=4)
+    return True
 
 
 def _by_target(table: Table, reading: str, target: str, columns: Mapping[str, Array], of: Mapping[str, str]) -> None:

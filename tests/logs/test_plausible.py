@@ -7,7 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from bayessim_mjx.logs import read_logs
+from bayessim_mjx.logs import Channels, read_logs
+from bayessim_mjx.logs.doubts import _held_by_its_range
 from bayessim_mjx.logs.importers import cdr
 from tests.logs.log_files import rows, write
 
@@ -81,3 +82,20 @@ def test_numbers_are_decoded_as_the_general_decoder_does() -> None:
     for _ in range(3):
         decode(b"\x00\x00 another order of bytes")
     assert len(calls) == 3
+
+
+@pytest.mark.parametrize(
+    ("angle", "reach", "gear", "warned"),
+    [("degree", 1.8, 1, True), ("radian", 1.8, 1, False), ("radian", 6.2, 1, False), ("radian", 90.0, 50, False)],
+)
+def test_a_range_in_rad_that_the_model_reads_as_degrees_is_named(angle, reach, gear, warned):
+    """Ranges beside the commands of a servo, also of one with twice the range of its joint, or behind a gear."""
+    model = mujoco.MjModel.from_xml_string(f"""
+      <mujoco><compiler angle="{angle}" autolimits="true"/><worldbody><body name="arm">
+        <joint name="lift" axis="0 1 0" limited="true" range="-1.8 1.8"/><geom size=".1"/></body></worldbody>
+      <actuator><position name="servo" joint="lift" kp="9" gear="{gear}" ctrlrange="-{reach} {reach}"/>
+      </actuator></mujoco>""")
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        held = _held_by_its_range(model, 0, 0, Channels.of(model))
+    assert held == warned == any("angles in an MJCF are degrees" in str(w.message) for w in found)
