@@ -89,7 +89,7 @@ def test_numbers_are_decoded_as_the_general_decoder_does() -> None:
     [("degree", 1.8, 1, True), ("radian", 1.8, 1, False), ("radian", 6.2, 1, False), ("radian", 90.0, 50, False)],
 )
 def test_a_range_in_rad_that_the_model_reads_as_degrees_is_named(angle, reach, gear, warned):
-    """Ranges beside the commands of a servo, also of one with twice the range of its joint, or behind a gear."""
+    """Ranges beside the commands of a servo; those may reach beyond the range, and stand before a gear."""
     model = mujoco.MjModel.from_xml_string(f"""
       <mujoco><compiler angle="{angle}" autolimits="true"/><worldbody><body name="arm">
         <joint name="lift" axis="0 1 0" limited="true" range="-1.8 1.8"/><geom size=".1"/></body></worldbody>
